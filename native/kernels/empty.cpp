@@ -1,0 +1,1 @@
+namespace spikerig::SPIKERIG_ISA { void nothing() {} }
