@@ -64,9 +64,7 @@ def assemble(argv: list[str]) -> typer.Typer:
 
     @app.callback(invoke_without_command=True)
     def root(
-        show_version: bool = typer.Option(
-            False, "--version", help="Print the version and stop.", is_eager=True
-        ),
+        show_version: bool = typer.Option(False, "--version", help="Print the version and stop.", is_eager=True),
     ) -> None:
         if show_version:
             typer.echo(version("spikerig"))
@@ -114,9 +112,7 @@ def run(argv: list[str]) -> int:
     except typer.Exit as leave:
         return leave.exit_code
     except (KeyboardInterrupt, typer.Abort):
-        return _tell(
-            {"type": "Interrupted", "exit_code": 130, "what": "interrupted"}, "interrupted", 130, as_json
-        )
+        return _tell({"type": "Interrupted", "exit_code": 130, "what": "interrupted"}, "interrupted", 130, as_json)
     except BrokenPipeError:  # `spikerig ... | head`
         sys.stderr.close()
         return 0

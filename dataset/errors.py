@@ -29,9 +29,7 @@ class RigError(Exception):
 
     exit_code = 70
 
-    def __init__(
-        self, what: str, *, value: Any = None, expected: str = "", cause: str = "", next: str = ""
-    ) -> None:
+    def __init__(self, what: str, *, value: Any = None, expected: str = "", cause: str = "", next: str = "") -> None:
         self.what, self.value, self.expected, self.cause, self.next = what, value, expected, cause, next
         super().__init__(what)
 

@@ -43,12 +43,7 @@ class Camera:
     def __post_init__(self) -> None:
         _set(self, "K", np.float64)
         _set(self, "distortion", np.float64)
-        if (
-            self.K.shape != (3, 3)
-            or not np.all(np.isfinite(self.K))
-            or self.K[0, 0] <= 0
-            or self.K[1, 1] <= 0
-        ):
+        if self.K.shape != (3, 3) or not np.all(np.isfinite(self.K)) or self.K[0, 0] <= 0 or self.K[1, 1] <= 0:
             raise DataError("a camera matrix must be finite, 3x3, with positive focal lengths", value=self.K)
         if self.width < 1 or self.height < 1:
             raise DataError("a camera needs at least one pixel", value=(self.width, self.height))
@@ -59,9 +54,7 @@ class Camera:
         if not 0 < fov_x_deg < 180:
             raise UsageError("a field of view lies between 0 and 180 degrees", value=fov_x_deg)
         f = width / 2 / np.tan(np.radians(fov_x_deg) / 2)
-        return Camera(
-            np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]]), np.zeros(0), width, height
-        )
+        return Camera(np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]]), np.zeros(0), width, height)
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,9 +181,7 @@ class View:
         _set(self, "valid", np.bool_)
         shape = self.frame.pixels.shape[:2]
         if self.sensor_row.shape != shape or self.valid.shape != shape:
-            raise DataError(
-                "sensor_row and valid must have the frame's size", value=self.name, expected=str(shape)
-            )
+            raise DataError("sensor_row and valid must have the frame's size", value=self.name, expected=str(shape))
         if self.split not in ("train", "test"):
             raise DataError("a view is for train or test", value=self.split)
 
