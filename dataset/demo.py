@@ -66,8 +66,8 @@ def demo(
 ) -> None:
     """The whole road on one command: photons to a sharper picture, with the numbers.
 
-    Simulates a shaken capture with a spike camera beside the RGB camera, trains the same 3D scene from the same start for
-    equal seconds with and without spikes, scores sharp held-out views, and writes report.html and report.json.
+    Simulates a shaken capture with a spike camera beside the RGB camera, trains the same 3D scene from the same start
+    for equal seconds with and without spikes, scores sharp held-out views, and writes report.html and report.json.
     An interrupted demo goes on where it stopped. Exit codes: 0 ok, else that of the step that failed.
     """
     from spikerig.dataset import report

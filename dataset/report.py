@@ -6,6 +6,7 @@ import base64
 import html
 import io
 import json
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -63,8 +64,6 @@ def build(out: Path, plan: Sequence[Any], done: dict[str, Any]) -> dict[str, Any
     scenes = list(dict.fromkeys(key.split("-")[0] for key in done))
     results = {scene: _scene(out, scene, done) for scene in scenes}
     first = results[scenes[0]]
-    import shlex
-
     document = {
         **{k: v for k, v in first.items() if k != "history"},
         "seconds": sum(step["seconds"] for step in done.values()),
@@ -253,9 +252,9 @@ def _page(result: dict[str, Any], pictures: dict[str, dict[str, bytes]]) -> str:
         "border-bottom:1px solid #ccc;text-align:right}td:first-child,th:first-child{text-align:left}"
         "code{font-size:12px;overflow-wrap:anywhere}.big{font-size:1.25em}</style>",
         "<h1>From photons to a sharper picture</h1>",
-        "<p>A simulated rig looked at a scene while a hand shook it: one blurry picture and some 320 one-bit spike frames "
-        "a view. The same 3D model was then trained from the same start for equal seconds in each row below, and scored on "
-        "sharp views that no row was trained on.</p>",
+        "<p>A simulated rig looked at a scene while a hand shook it: one blurry picture and some 320 one-bit spike "
+        "frames a view. The same 3D model was then trained from the same start for equal seconds in each row below, "
+        "and scored on sharp views that no row was trained on.</p>",
     ]
     for scene, r in result["scenes"].items():
         parts.append(f"<h2>Scene '{esc(scene)}'</h2>")
@@ -268,7 +267,8 @@ def _page(result: dict[str, Any], pictures: dict[str, dict[str, bytes]]) -> str:
         parts.append("<p class='big'>" + " · ".join(f"<b>{v:.2f}</b> {t}" for v, t in told if v is not None) + "</p>")
         parts.append(_img(pictures[scene]["sheet"], "png", f"captures and renders of {scene}"))
         parts.append(
-            "<table><tr><th>method</th><th>PSNR dB</th><th>luma PSNR</th><th>SSIM</th><th>steps</th><th>seconds</th></tr>"
+            "<table><tr><th>method</th><th>PSNR dB</th><th>luma PSNR</th><th>SSIM</th><th>steps</th>"
+            "<th>seconds</th></tr>"
         )
         for name, m in r["methods"].items():
             parts.append(
@@ -276,8 +276,8 @@ def _page(result: dict[str, Any], pictures: dict[str, dict[str, bytes]]) -> str:
                 f"<td>{m['ssim']:.4f}</td><td>{m['steps']}</td><td>{m['train_seconds']:.1f}</td></tr>"
             )
         parts.append(
-            f"</table><p>A blurry view is labelled with its <b>{esc(str(r['pose_label']))}</b>-exposure pose, here and in "
-            "every row. PSNR: clipped, rounded to 8 bits, mean over views. Luma PSNR leaves colour errors out.</p>"
+            f"</table><p>A blurry view is labelled with its <b>{esc(str(r['pose_label']))}</b>-exposure pose, here and "
+            "in every row. PSNR: clipped, rounded to 8 bits, mean over views. Luma PSNR leaves colour errors out.</p>"
         )
         parts.append(_img(pictures[scene]["curve"], "svg+xml", "PSNR over training seconds"))
         parts.append(_img(pictures[scene]["errors"], "png", "error maps"))
