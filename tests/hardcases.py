@@ -1,7 +1,7 @@
 """The table of hard cases: which hard input meets which function, and what must come out.
 
-Each part keeps its own rows in `hard_<part>.py` as `ROWS = [(case, function, expectation, test)]`, `test` naming the test
-that holds it. This file gathers them; `docs/hardcases.md` is made from it (`python tests/hardcases.py > docs/hardcases.md`).
+Each part keeps its own rows in `hard_<part>.py` as `ROWS = [(case, function, expectation, test)]`, `test` naming the
+test that holds it. This file gathers them and makes the page: `python tests/hardcases.py > docs/hardcases.md`.
 """
 
 from __future__ import annotations
