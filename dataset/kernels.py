@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
 from spikerig import _native
 from spikerig.dataset.errors import NumericsError, UsageError
 

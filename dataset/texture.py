@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
 from spikerig.dataset import kernels
 from spikerig.dataset.clocktime import frozen_array
 from spikerig.dataset.errors import UsageError
