@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 import tempfile
+from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points, version
 from pathlib import Path
 
@@ -45,7 +46,7 @@ def commands() -> dict[str, EntryPoint]:
     return found
 
 
-def _stub(name: str) -> typer.models.CommandFunctionType:  # type: ignore[name-defined]
+def _stub(name: str) -> Callable[[], None]:
     def stub() -> None:
         raise AssertionError(f"{name} was listed, not loaded")
 
