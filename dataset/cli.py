@@ -13,6 +13,7 @@ from importlib.metadata import EntryPoint, entry_points, version
 from pathlib import Path
 
 import typer
+
 from spikerig.dataset.errors import RigError, UsageError
 from spikerig.dataset.terminal import emit, note
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+
 from spikerig.dataset.errors import DataError, NumericsError, RigError, UsageError
 from spikerig.dataset.terminal import emit, note
 

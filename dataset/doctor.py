@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+
 from spikerig.dataset.terminal import emit, note
 
 # distribution -> (module, what it is for); only looked up, never imported, so that a broken one cannot end the check

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from spikerig.dataset import machine
 from spikerig.dataset.errors import DataError, HostError
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from numpy.typing import NDArray
+
 from spikerig.dataset import cost
 from spikerig.dataset.cost import Setting
 from spikerig.dataset.errors import UsageError

@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+
 from spikerig.dataset import cli
 from spikerig.dataset.errors import DataError, DeviceError, HostError, NumericsError, RefusedError, RigError, UsageError
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from spikerig.dataset.clocktime import ClockModel, ns_from_tick, tick_from_ns
 from spikerig.dataset.errors import UsageError
 

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+
 from spikerig.dataset import cost
 from spikerig.dataset.errors import DataError, UsageError
 

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
+
 from spikerig.dataset import cli, demo, report
 from spikerig.dataset.errors import RigError, UsageError
 
