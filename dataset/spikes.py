@@ -6,12 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-<<<<<<< HEAD
-from spikerig.dataset.clocktime import NS, frozen_array, ns_from_tick, tick_from_ns
-=======
 
-from spikerig.dataset.clocktime import frozen_array, tick_from_ns
->>>>>>> main
+from spikerig.dataset.clocktime import NS, frozen_array, ns_from_tick, tick_from_ns
 from spikerig.dataset.errors import DataError, UsageError
 
 
