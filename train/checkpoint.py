@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+
 from spikerig.dataset.errors import DataError, HostError
 from spikerig.dataset.terminal import jsonable
 

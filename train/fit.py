@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
+
 from spikerig.dataset.errors import NumericsError
 from spikerig.dataset.scene import Camera
 from spikerig.train import checkpoint
@@ -26,7 +28,6 @@ from spikerig.train.kernels import l1_ssim
 from spikerig.train.losses import average_exposure, l2_loss, mean_weights, tfs_loss
 from spikerig.train.model import BACKGROUNDS, Model, splats_of
 from spikerig.train.targets import Targets, TrainView
-from torch import Tensor
 
 RATES = {
     "means": "lr_means",
@@ -53,12 +54,13 @@ class State:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Task:
-    """What a fit works with and does not change."""
+    """What a fit works with and does not change; `gray` [4] is the frozen converter, or where the learned one starts."""
 
     config: FitConfig
     camera: Camera
     gauge: Gauge
     targets: Targets
+    gray: Tensor
 
     @property
     def weight(self) -> float:
@@ -74,7 +76,7 @@ class Task:
 def new_state(params: dict[str, Tensor], task: Task) -> State:
     """Step 0: the given splats, and the gray converter where it is learned."""
     if task.config.gray == "learned" and task.targets.gray is not None:
-        params = {**params, "gray": torch.tensor([*task.targets.gray.weights, task.targets.gray.bias])}
+        params = {**params, "gray": task.gray}
     leaves = {name: p.detach().clone().requires_grad_() for name, p in params.items()}
     return State(leaves, _adam(leaves))
 
@@ -166,9 +168,7 @@ def view_loss(state: State, task: Task, view: TrainView, fraction: float, rng: n
     if fraction < config.ratio_until:
         phase = targets.ratio[rng.integers(len(targets.ratio))]
         pictures = {phase: draw(phase)}
-        target = view.instants[phase].ratio
-        assert target is not None  # noqa: S101 (made whenever ratio_until > 0)
-        loss = colour_loss(pictures[phase], target.float(), view.valid, config)
+        loss = colour_loss(pictures[phase], view.instants[phase].ratio.float(), view.valid, config)
         supervised: tuple[float, ...] = (phase,)
     else:
         supervised = targets.tfs
@@ -185,11 +185,7 @@ def view_loss(state: State, task: Task, view: TrainView, fraction: float, rng: n
 
 
 def _tfs_term(state: State, task: Task, view: TrainView, pictures: dict[float, Tensor]) -> Tensor:
-    gray = state.params.get("gray")
-    if gray is None:
-        found = task.targets.gray
-        assert found is not None  # noqa: S101 (made whenever a term reads spikes)
-        gray = torch.tensor([*found.weights, found.bias])
+    gray = state.params.get("gray", task.gray)
     terms = [
         tfs_loss(picture, texture, weight, gray, task.config.tfs_domain)
         for phase, picture in pictures.items()

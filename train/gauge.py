@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from spikerig.dataset.errors import DataError
 from spikerig.dataset.scene import Floats
 

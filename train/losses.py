@@ -9,9 +9,10 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from torch import Tensor
+
 from spikerig import _native
 from spikerig.dataset.errors import UsageError
-from torch import Tensor
 
 DOMAINS = {"encoded": 0, "linear": 1, "luma": 2, "naive": 2}  # what the gray of a picture is compared as
 REC601 = (0.299, 0.587, 0.114)

@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+
 from spikerig.dataset.errors import UsageError
 
 Picture = NDArray[np.float64]

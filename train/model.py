@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+
 from spikerig.dataset.errors import DataError
 from spikerig.dataset.scene import Camera, Floats
 from spikerig.train.config import FitConfig

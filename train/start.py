@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
+
 from spikerig.dataset.errors import DataError
 from spikerig.dataset.scene import Points
 from spikerig.dataset.terminal import note

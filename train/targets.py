@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+
 from spikerig.dataset.clocktime import ClockModel
 from spikerig.dataset.errors import DataError
 from spikerig.dataset.scene import Floats, View
@@ -32,12 +33,12 @@ class Instant:
     """An instant of a view's exposure: pose float32[3,4] in the gauge, TfS targets, colour target.
 
     `textures` are pairs (texture [H,W] as tfs_domain wants it, mean weights [H,W]); `ratio` is float16[H,W,3] codes
-    (rounding below 1/16 of an 8-bit step) or None.
+    (rounding below 1/16 of an 8-bit step), empty where no step uses it.
     """
 
     pose: torch.Tensor
-    textures: tuple[tuple[torch.Tensor, torch.Tensor], ...] = ()
-    ratio: torch.Tensor | None = None
+    textures: tuple[tuple[torch.Tensor, torch.Tensor], ...]
+    ratio: torch.Tensor
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -217,7 +218,7 @@ def _finish(
     clipped = light.clamp(0, 1)
     made: dict[float, Instant] = {}
     for phase, pose in raw["pose"].items():
-        textures, target = (), None
+        textures, target = (), torch.zeros(0, dtype=torch.half)
         if gray is not None and phase in raw["textures"]:
             found = raw["textures"][phase]
             averaged = average_texture(found)

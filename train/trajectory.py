@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
 from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.scene import Floats, Frame, Trajectory, View
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+
 from spikerig import _native
 from spikerig.dataset.errors import UsageError
 from spikerig.train.losses import (

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from spikerig.dataset.errors import UsageError
 from spikerig.train.metrics import SSIM_VARIANTS, chroma_psnr, luma_psnr, psnr, rounded, ssim
 
