@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
 from spikerig.dataset.clocktime import ClockModel, frozen_array
 from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.spikes import SpikeStream

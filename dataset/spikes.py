@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+
 from spikerig.dataset.clocktime import frozen_array, tick_from_ns
 from spikerig.dataset.errors import DataError, UsageError
 
