@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+
 from spikerig.dataset.errors import DataError, HostError, RigError, UsageError
 
 RULES = 1  # raise it when the rules change: files judged by older rules are judged again

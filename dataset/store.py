@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, cast
 import h5py
 import numpy as np
 from numpy.typing import NDArray
+
 from spikerig.dataset.clocktime import ClockModel
 from spikerig.dataset.errors import DataError
 from spikerig.dataset.hdf5_guard import ask_child, check_attribute, hdf5_faults, member, open_file, refuse, spot

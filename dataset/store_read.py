@@ -9,6 +9,7 @@ from typing import Any, Self
 import h5py
 import numpy as np
 from numpy.typing import NDArray
+
 from spikerig.dataset.clocktime import ClockModel, ns_from_tick
 from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.hdf5_guard import hdf5_faults, refuse, spot

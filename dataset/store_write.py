@@ -20,6 +20,7 @@ from typing import Any, Self
 import h5py
 import numpy as np
 from numpy.typing import ArrayLike
+
 from spikerig.dataset.clocktime import ClockModel
 from spikerig.dataset.errors import HostError, NumericsError, UsageError
 from spikerig.dataset.hdf5_guard import MAX_TEXT, remember

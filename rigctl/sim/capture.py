@@ -10,6 +10,7 @@ from multiprocessing import get_context
 
 import numpy as np
 from numpy.typing import NDArray
+
 from spikerig.dataset.scene import Camera, Frame, Points, Pose, Trajectory, View
 from spikerig.rigctl.sim.draws import stream
 from spikerig.rigctl.sim.light import Stage, stage_of
@@ -132,7 +133,7 @@ def _light(
     return Light(rgb, plan.knots - first, (-first, spec.exposure.ticks - first), spec.exposure.rate_hz, t0_ns)
 
 
-def _view(name, frame, spikes, pose, trajectory, split) -> View:  # noqa: ANN001
+def _view(name, frame, spikes, pose, trajectory, split) -> View:
     height, width = frame.pixels.shape[:2]
     rows = np.repeat(np.arange(height, dtype=np.float32)[:, None], width, 1)
     return View(name, frame, spikes, rows, np.ones((height, width), bool), Pose(pose), trajectory, split)

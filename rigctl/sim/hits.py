@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
 from spikerig.rigctl.sim.world import Box, Rect, Room, Solid, Sphere
 
 Floats = NDArray[np.float32]

@@ -6,6 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+
 from spikerig.dataset.scene import Camera
 from spikerig.rigctl.sim.hits import HIT, TINY, Axes, Floats, dot, screen
 from spikerig.rigctl.sim.pattern import albedo

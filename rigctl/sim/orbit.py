@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
 from spikerig.rigctl.sim.spec import Orbit
 
 Floats = NDArray[np.float64]

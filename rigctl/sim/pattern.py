@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
 from spikerig.rigctl.sim.limits import limits
 
 Floats = NDArray[np.float32]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
 from spikerig.dataset.errors import NumericsError, UsageError
 from spikerig.dataset.images import srgb_from_linear
 from spikerig.dataset.kernels import fire

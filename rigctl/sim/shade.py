@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
 from spikerig.rigctl.sim.hits import NEAR, Axes, Floats, box_frame, dot3, vec3
 from spikerig.rigctl.sim.pattern import Texture, lattice
 from spikerig.rigctl.sim.world import Box, Rect, Room, Solid, Sphere, Vec3, World

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
 from spikerig.dataset.scene import Camera
 from spikerig.rigctl.sim.spec import Exposure, Shake
 

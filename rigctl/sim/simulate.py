@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.scene import Frame
 from spikerig.dataset.spikes import SpikeStream

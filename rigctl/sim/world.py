@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
 from spikerig.rigctl.sim.limits import Faults, limits, nearest, read_record
 from spikerig.rigctl.sim.pattern import Texture
 

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
 from spikerig.rigctl.sim.draws import stream
 from spikerig.rigctl.sim.limits import Faults, nearest, read_record
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+
 from spikerig.rigctl.sim.effects import Facts, Floats, Hooks, Site, Stage
 from spikerig.rigctl.sim.limits import limits
 

@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+
 from spikerig.rigctl.sim.effects import Facts, Floats, Hooks, Site, Stage
 from spikerig.rigctl.sim.limits import limits
 
