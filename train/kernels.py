@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
 from spikerig import _native
 from spikerig.dataset.errors import NumericsError, UsageError
 
@@ -151,5 +152,3 @@ def render_backward(
     camera = np.empty(12, np.float64)
     _native.render_backward(state, *arrays, image, alpha, image_grad, alpha_grad, *grads, screen, camera)
     return grads, screen, camera.reshape(3, 4)
-
-

@@ -65,7 +65,9 @@ def harmonics(degree: int, direction: torch.Tensor) -> torch.Tensor:
     x, y, z = direction.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
     rows = [torch.full_like(x, 0.28209479177387814)]
-    rows += [k * v for k, v in zip((-0.4886025119029199, 0.4886025119029199, -0.4886025119029199), (y, z, x), strict=True)]
+    rows += [
+        k * v for k, v in zip((-0.4886025119029199, 0.4886025119029199, -0.4886025119029199), (y, z, x), strict=True)
+    ]
     rows += [
         1.0925484305920792 * x * y,
         -1.0925484305920792 * y * z,
@@ -137,7 +139,9 @@ def shares(p: Footprints, pixels: torch.Tensor) -> tuple[torch.Tensor, torch.Ten
     power = ((p.factor[:, 0] * dx + p.factor[:, 1] * dy) ** 2 + (p.factor[:, 2] * dy) ** 2) / 2
     free = (p.log_opacity - power).exp()
     alpha = torch.where(free >= ALPHA_MIN, free.clamp(max=ALPHA_MAX), 0.0)
-    light = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha[:, :-1]], 1), 1) if len(p.index) else alpha
+    light = (
+        torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha[:, :-1]], 1), 1) if len(p.index) else alpha
+    )
     return free, light
 
 
