@@ -215,7 +215,8 @@ class Scene:
     """A packaged RS-3D scene: one camera, views of it, sparse points, and (simulated scenes only) the truth.
 
     `light_gain` is the texture value (spikes a tick) of RGB white (linear 1.0): known for simulated scenes, measured
-    by calibration for real ones, None where unknown. `info` is free provenance, JSON-ready.
+    by calibration for real ones, None where unknown. `info` is free provenance, JSON-ready. `clock` is the take's map
+    of the spike camera's time to the rig's, `calibration` the rig's as a JSON-ready record; None where there is none.
     """
 
     name: str
@@ -225,6 +226,8 @@ class Scene:
     truth: Truth | None = None
     light_gain: float | None = None
     info: Mapping[str, Any] = field(default_factory=dict)
+    clock: ClockModel | None = None
+    calibration: Mapping[str, Any] | None = None
 
     def view(self, name: str) -> View:
         """The view of that name."""
