@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
 from spikerig.dataset.errors import DataError, NumericsError, UsageError
 from spikerig.dataset.texture import Texture
 
