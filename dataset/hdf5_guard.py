@@ -35,6 +35,7 @@ FILTERS = {1: "deflate", 2: "shuffle", 3: "fletcher32"}
 MAX_OBJECTS, MAX_DEPTH, MAX_ATTRIBUTES, MAX_TEXT = 500_000, 12, 64, 1 << 16
 MAX_CHUNK = 1 << 26
 MAX_INFLATION = 1100  # deflate's limit is 1032
+PATIENCE_S = 15
 _MEMORY = 4 << 30
 _KEPT = 4096
 _healthy: set[str] = set()
@@ -274,7 +275,7 @@ def ask_child(task: str, path: str | Path) -> Any:
     Raises:
         DataError: the child refused the file, crashed, hung, or ran out of memory on it.
     """
-    limit_s = 15 + math.ceil(check_plain(path).st_size / 40e6)
+    limit_s = PATIENCE_S + math.ceil(check_plain(path).st_size / 40e6)
     command = [sys.executable, "-P", "-m", "spikerig.dataset.hdf5_guard", task, os.path.abspath(path), str(limit_s)]
     env = os.environ | {"HDF5_PLUGIN_PRELOAD": "::", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     try:
@@ -295,7 +296,8 @@ def ask_child(task: str, path: str | Path) -> Any:
     return answer["found"]
 
 
-def _limit(limit_s: int) -> None:
+def limit_itself(limit_s: int) -> None:
+    """Bound this process's memory and CPU time; no core dump, no file written."""
     import resource
 
     for what, bound in (
@@ -323,7 +325,7 @@ def _probe(path: str) -> None:
 def main(words: list[str]) -> int:
     """The child: limit itself, do the task, answer in JSON on stdout."""
     task, path, limit_s = words
-    _limit(int(limit_s))
+    limit_itself(int(limit_s))
     answer: dict[str, Any] = {"found": None}
     try:
         if task == "verify":

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.dataset.clocktime import frozen_array, tick_from_ns
+from spikerig.dataset.clocktime import NS, frozen_array, ns_from_tick, tick_from_ns
 from spikerig.dataset.errors import DataError, UsageError
 
 
@@ -51,8 +51,45 @@ class SpikeStream:
         """H."""
         return self.bits.shape[1]
 
+    @staticmethod
+    def from_pixels(spikes: NDArray, rate_hz: float | None = None, t0_ns: int = 0) -> SpikeStream:
+        """Pack unpacked spikes [T,H,W], bool or 0/1, any integer type."""
+        if spikes.ndim != 3 or spikes.shape[2] < 1:
+            raise UsageError("unpacked spikes are [T,H,W]", value=spikes.shape)
+        return SpikeStream(np.packbits(spikes != 0, axis=2, bitorder="little"), spikes.shape[2], rate_hz, t0_ns)
+
     def tick_at(self, at_ns: int) -> float:
         """The (fractional) tick at a time on this stream's clock; tick k covers [k, k+1)."""
+        return float(tick_from_ns(at_ns, self._rate(), self.t0_ns))
+
+    def tick_range(self, t0_ns: int, t1_ns: int) -> tuple[int, int]:
+        """The half-open range of ticks that overlap [t0_ns, t1_ns), clipped to the stream; empty where none does.
+
+        Edges:
+            A tick that only touches the window, or overlaps it by less than a hundredth of a nanosecond, is left out.
+        """
+        slack = 1e-2 * self._rate() / NS
+        first = int(np.floor(self.tick_at(t0_ns) + slack))
+        last = int(np.ceil(self.tick_at(t1_ns) - slack))
+        first = min(max(first, 0), self.ticks)
+        return first, min(max(last, first), self.ticks)
+
+    def slice(self, t0: int, t1: int) -> SpikeStream:
+        """Ticks [t0, t1) as a stream of its own; shares memory, moves t0_ns (where the rate is known) and `lost`."""
+        if not 0 <= t0 <= t1 <= self.ticks:
+            raise UsageError("a slice must lie in the stream", value=f"[{t0}, {t1})", expected=f"in [0, {self.ticks})")
+        start = self.t0_ns if self.rate_hz is None else int(ns_from_tick(t0, self.rate_hz, self.t0_ns))
+        lost = np.clip(self.lost, t0, t1) - t0
+        return SpikeStream(self.bits[t0:t1], self.width, self.rate_hz, start, self.clock, lost[lost[:, 0] < lost[:, 1]])
+
+    def lost_before(self) -> NDArray[np.int64]:
+        """int64[T+1]: how many of the ticks before each one were lost; differences count lost ticks in a range."""
+        edges = np.zeros(self.ticks + 1, np.int64)
+        for first, stop in np.clip(self.lost, 0, self.ticks):
+            edges[first + 1 : stop + 1] = 1
+        return edges.cumsum()
+
+    def _rate(self) -> float:
         if self.rate_hz is None:
             raise UsageError("this stream has no rate, so it has no time", next="give --rate-hz")
-        return float(tick_from_ns(at_ns, self.rate_hz, self.t0_ns))
+        return self.rate_hz
