@@ -4,6 +4,7 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
+
 from spikerig.dataset.clocktime import ClockModel
 from spikerig.dataset.scene import Camera, Frame, Points, Pose, Scene, Trajectory, Truth, View
 from spikerig.dataset.spikes import SpikeStream
