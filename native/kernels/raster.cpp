@@ -1,0 +1,168 @@
+// One tile of the picture, forward and backward. Oracle: train/oracles.py raster.
+//
+// A vector is a block of pixels, 4 wide and LANES / 4 tall; a tile is 4 blocks wide. Each splat of the tile's list, front
+// to back, visits the blocks its box meets: light T and colour live in the tile, the splat's sums in registers.
+#include "../train_kernels.hpp"
+#include "float_lanes.hpp"
+
+namespace spikerig::SPIKERIG_ISA {
+namespace {
+
+constexpr int TALL = LANES / 4;              // pixel rows of a block
+constexpr int BLOCK_ROWS = TILE / TALL;      // block rows of a tile
+constexpr int BLOCKS = 4 * BLOCK_ROWS;
+constexpr float NEVER = -7.994353436858858f;  // log2(ALPHA_MIN)
+
+struct Offsets {
+  vf x, y;  // pixel centres of a block's lanes, from its corner
+};
+
+Offsets offsets() {
+  Offsets out;
+  for (int l = 0; l < LANES; ++l) out.x[l] = l % 4 + 0.5f, out.y[l] = l / 4 + 0.5f;
+  return out;
+}
+
+// Blocks that a box of this reach around (x, y), both from the tile's corner, can meet; one bit a block, row by row.
+inline uint64_t blocks_met(float x, float y, float reach_x, float reach_y) {
+  float left = x - reach_x - 0.5f, right = x + reach_x - 0.5f, top = y - reach_y - 0.5f, bottom = y + reach_y - 0.5f;
+  if (!(right >= 0 && bottom >= 0 && left <= TILE - 1 && top <= TILE - 1)) return 0;
+  int x0 = left > 0 ? static_cast<int>(left) / 4 : 0, x1 = right < TILE - 1 ? static_cast<int>(right) / 4 : 3;
+  int y0 = top > 0 ? static_cast<int>(top) / TALL : 0;
+  int y1 = bottom < TILE - 1 ? static_cast<int>(bottom) / TALL : BLOCK_ROWS - 1;
+  uint64_t columns = (2u << x1) - (1u << x0);
+  uint64_t every_row = 0x1111111111111111u;
+  every_row = (every_row >> (60 - 4 * (y1 - y0))) << 4 * y0;
+  return columns * every_row;
+}
+
+inline uint64_t slot_of(const Frame &f, int splat, int tx, int ty) {
+  const Footprint &p = f.footprints.data[splat];
+  return f.first_slot.data[splat] + static_cast<int64_t>(ty - p.y0) * (p.x1 - p.x0) + (tx - p.x0);
+}
+
+// Copies of the picture's channels for a tile, block by block; lanes outside the picture are 0.
+struct Corner {
+  int x, y, wide, tall;  // of the tile, and how much of it is inside the picture
+};
+
+Corner corner(const Frame &f, int tile) {
+  Corner c{tile % f.tiles_x * TILE, tile / f.tiles_x * TILE, TILE, TILE};
+  if (c.wide > f.camera.width - c.x) c.wide = f.camera.width - c.x;
+  if (c.tall > f.camera.height - c.y) c.tall = f.camera.height - c.y;
+  return c;
+}
+
+template <class Visit>
+inline void each_pixel(const Frame &f, const Corner &c, Visit visit) {  // visit(lane in the tile, pixel in the picture)
+  for (int y = 0; y < c.tall; ++y)
+    for (int x = 0; x < c.wide; ++x)
+      visit((y / TALL * 4 + x / 4) * LANES + y % TALL * 4 + x % 4, static_cast<int64_t>(c.y + y) * f.camera.width + c.x + x);
+}
+
+}  // namespace
+
+void raster_tile(Frame &f, int tile) {
+  alignas(64) vf light[BLOCKS], red[BLOCKS], green[BLOCKS], blue[BLOCKS];
+  const Offsets at = offsets();
+  const Corner c = corner(f, tile);
+  const int tx = tile % f.tiles_x, ty = tile / f.tiles_x;
+  for (int b = 0; b < BLOCKS; ++b) light[b] = red[b] = green[b] = blue[b] = vf{};
+  each_pixel(f, c, [&](int lane, int64_t) { reinterpret_cast<float *>(light)[lane] = 1.0f; });
+  const vf never = splat(NEVER), least = splat(LIGHT_MIN), most = splat(ALPHA_MAX);
+  uint64_t live = 0;
+  for (int b = 0; b < BLOCKS; ++b) live |= static_cast<uint64_t>(any(at_least(light[b], least))) << b;
+  const int32_t *list = f.list.data;
+  const int64_t end = f.tile_start.data[tile + 1];
+  for (int64_t k = f.tile_start.data[tile]; k < end && live; ++k) {
+    if (k + 4 < end) __builtin_prefetch(&f.footprints.data[list[k + 4]]);
+    const Footprint &s = f.footprints.data[list[k]];
+    const float x = static_cast<float>(s.x - c.x), y = static_cast<float>(s.y - c.y);
+    uint64_t todo = blocks_met(x, y, s.reach_x, s.reach_y) & live, touched = 0;
+    for (; todo; todo &= todo - 1) {
+      const int b = __builtin_ctzll(todo);
+      const vf dx = at.x + (4 * (b % 4) - x), dy = at.y + (TALL * (b / 4) - y);
+      const vf u = s.p * dx + s.r * dy, v = s.s * dy;
+      const vf power = s.log2_opacity - v * v - u * u;
+      vf t = light[b];
+      const mask on = both(at_least(power, never), at_least(t, least));
+      if (!any(on)) continue;
+      touched |= uint64_t{1} << b;
+      const vf w = keep(on, smaller(exp2_lanes(power), most)) * t;
+      t -= w;
+      light[b] = t;
+      red[b] += w * s.red;
+      green[b] += w * s.green;
+      blue[b] += w * s.blue;
+      if (!any(at_least(t, least))) live &= ~(uint64_t{1} << b);
+    }
+    f.touched.data[slot_of(f, list[k], tx, ty)] = touched;
+  }
+  each_pixel(f, c, [&](int lane, int64_t pixel) {
+    float t = reinterpret_cast<float *>(light)[lane], *out = f.image + 3 * pixel;
+    out[0] = reinterpret_cast<float *>(red)[lane] + t * f.background[0];
+    out[1] = reinterpret_cast<float *>(green)[lane] + t * f.background[1];
+    out[2] = reinterpret_cast<float *>(blue)[lane] + t * f.background[2];
+    f.alpha[pixel] = 1.0f - t;
+  });
+}
+
+// Front to back again, with the light T recomputed and what lies behind kept as one number a pixel: S starts at
+// <picture, gradient> and loses each splat's share, so d(loss)/d(alpha) = T <colour, gradient> - S / (1 - alpha).
+void raster_tile_back(Frame &f, int tile) {
+  alignas(64) vf light[BLOCKS], behind[BLOCKS], red[BLOCKS], green[BLOCKS], blue[BLOCKS];
+  const Offsets at = offsets();
+  const Corner c = corner(f, tile);
+  const int tx = tile % f.tiles_x, ty = tile / f.tiles_x;
+  for (int b = 0; b < BLOCKS; ++b) light[b] = behind[b] = red[b] = green[b] = blue[b] = vf{};
+  each_pixel(f, c, [&](int lane, int64_t pixel) {
+    const float *g = f.image_grad + 3 * pixel, *out = f.image + 3 * pixel;
+    reinterpret_cast<float *>(light)[lane] = 1.0f;
+    reinterpret_cast<float *>(red)[lane] = g[0];
+    reinterpret_cast<float *>(green)[lane] = g[1];
+    reinterpret_cast<float *>(blue)[lane] = g[2];
+    reinterpret_cast<float *>(behind)[lane] = out[0] * g[0] + out[1] * g[1] + out[2] * g[2] - (1.0f - f.alpha[pixel]) * f.alpha_grad[pixel];
+  });
+  const vf never = splat(NEVER), least = splat(LIGHT_MIN), most = splat(ALPHA_MAX);
+  const int32_t *list = f.list.data;
+  const int64_t end = f.tile_start.data[tile + 1];
+  for (int64_t k = f.tile_start.data[tile]; k < end; ++k) {
+    if (k + 4 < end) __builtin_prefetch(&f.footprints.data[list[k + 4]]);
+    const uint64_t slot = slot_of(f, list[k], tx, ty);
+    uint64_t todo = f.touched.data[slot];
+    if (!todo) continue;
+    const Footprint &s = f.footprints.data[list[k]];
+    const float x = static_cast<float>(s.x - c.x), y = static_cast<float>(s.y - c.y);
+    vf sum[9] = {};
+    for (; todo; todo &= todo - 1) {
+      const int b = __builtin_ctzll(todo);
+      const vf dx = at.x + (4 * (b % 4) - x), dy = at.y + (TALL * (b / 4) - y);
+      const vf u = s.p * dx + s.r * dy, v = s.s * dy;
+      const vf power = s.log2_opacity - v * v - u * u;
+      const vf t = light[b];
+      const mask on = both(at_least(power, never), at_least(t, least));
+      const vf free = exp2_lanes(power);
+      const vf alpha = keep(on, smaller(free, most)), w = alpha * t;
+      const vf shade = s.red * red[b] + s.green * green[b] + s.blue * blue[b];
+      const vf rest = behind[b] - w * shade;
+      light[b] = t - w;
+      behind[b] = rest;
+      sum[6] += w * red[b];
+      sum[7] += w * green[b];
+      sum[8] += w * blue[b];
+      const vf d = keep(at_least(most, free), alpha * (t * shade - rest / (1.0f - alpha)));  // d loss / d log alpha
+      const vf du = d * u, dv = d * dy;
+      sum[0] += d;
+      sum[1] += du;
+      sum[2] += dv;
+      sum[3] += du * dx;
+      sum[4] += du * dy;
+      sum[5] += dv * dy;
+    }
+    float total[12];
+    sum_nine(sum, total);
+    __builtin_memcpy(f.slots.data + slot * SLOT, total, 9 * sizeof(float));
+  }
+}
+
+}  // namespace spikerig::SPIKERIG_ISA
