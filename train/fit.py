@@ -54,7 +54,7 @@ class State:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Task:
-    """What a fit works with and does not change; `gray` [4] is the frozen converter, or where the learned one starts."""
+    """What a fit works with and does not change; `gray` [4]: the frozen converter, or where the learned one starts."""
 
     config: FitConfig
     camera: Camera
