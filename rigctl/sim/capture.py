@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import dataclass
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass, fields, replace
+from math import fsum
 from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.dataset.scene import Camera, Frame, Points, Pose, Trajectory, View
+from spikerig.dataset.clocktime import ClockModel
+from spikerig.dataset.errors import HostError
+from spikerig.dataset.scene import Camera, Frame, Points, Pose, Trajectory, Truth, View
 from spikerig.rigctl.sim.draws import stream
+from spikerig.rigctl.sim.effects import parameters
 from spikerig.rigctl.sim.light import Stage, stage_of
 from spikerig.rigctl.sim.orbit import orbit_pose, target_depth
 from spikerig.rigctl.sim.sensor import Light, encode
@@ -168,15 +175,21 @@ def _exposure_counts(bits: NDArray[np.uint8], exposure: Exposure, width: int) ->
 
 
 def take_all(spec: SceneSpec, workers: int = 1) -> Iterator[Taken]:
-    """All views in order, cast by several processes; the same bits for any number of them."""
+    """All views in order, cast by several processes; the same bits for any number of them.
+
+    Args:
+        spec: the scene.
+        workers: processes; 1 works in this one.
+
+    Raises:
+        HostError: a worker process died.
+    """
     views = spec.orbit.views
-    workers = min(workers, views)
-    if workers <= 1:
-        stage = Stage(spec.world)
-        for number in range(views):
-            yield take_view(spec, number, stage)
+    if min(workers, views) <= 1:
+        yield from (take_view(spec, number) for number in range(views))
         return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+    pool = ProcessPoolExecutor(min(workers, views), mp_context=get_context("spawn"))
+    try:
         waiting: deque[Future[Taken]] = deque()
         for number in range(views):
             waiting.append(pool.submit(take_view, spec, number))
@@ -184,3 +197,80 @@ def take_all(spec: SceneSpec, workers: int = 1) -> Iterator[Taken]:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
+    except BrokenProcessPool as error:
+        raise HostError(
+            "a worker process died", cause="out of memory, or killed", next="give --workers 1, or a smaller picture"
+        ) from error
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def capture(
+    spec: SceneSpec,
+    path: str | Path,
+    *,
+    workers: int = 1,
+    force: bool = False,
+    done: Callable[[Taken], None] = lambda taken: None,
+) -> dict[str, Any]:
+    """Play a scene and write it, a view at a time.
+
+    Args:
+        spec: the scene.
+        path: of the scene file; it appears there complete or not at all.
+        workers: processes that cast and simulate.
+        force: replace an existing file.
+        done: called after each view is written.
+
+    Returns:
+        What was made, JSON-ready: counts, spikes an exposure, blur.
+
+    Raises:
+        UsageError: the file exists. HostError: the disk is full or a worker died.
+    """
+    from spikerig.dataset.store import SceneWriter
+
+    truth = Truth({}, {}, {}, ClockModel.identity(), _effects(spec), spec.seed, spec.exposure.label)
+    gain = spec.sensor.gain * fsum(spec.sensor.response)
+    told: list[Taken] = []
+    points: list[Points] = []
+    with SceneWriter(
+        path, spec.name, camera_of(spec), light_gain=gain, info=provenance(spec), truth=truth, force=force
+    ) as out:
+        for taken in take_all(spec, workers):
+            out.add(taken.view, light=taken.light, at_ns=taken.at_ns, trajectory=taken.trajectory)
+            points.append(taken.points)
+            told.append(replace(taken, view=replace(taken.view, spikes=None), points=_no_points()))
+            done(taken)
+        cloud = Points(np.concatenate([p.xyz for p in points]), np.concatenate([p.rgb for p in points]), "simulator")
+        out.points = cloud if len(cloud.xyz) else None
+    train = [t for t in told if t.view.split == "train"]
+    return {
+        "scene": spec.name,
+        "seed": spec.seed,
+        "train_views": len(train),
+        "test_views": len(told) - len(train),
+        "size": [spec.lens.width, spec.lens.height],
+        "ticks": spec.exposure.ticks,
+        "margin_ticks": spec.exposure.margin_ticks,
+        "rate_hz": spec.exposure.rate_hz,
+        "protocol": spec.exposure.protocol,
+        "pose_label": spec.exposure.label,
+        "light_gain": gain,
+        "effects": _effects(spec),
+        "points": len(cloud.xyz),
+        "spikes_mean": float(np.mean([t.spikes_mean for t in train])),
+        "spikes_max": max(t.spikes_max for t in train),
+        "blurry_psnr_db": float(np.mean([t.blur_db for t in train])),
+    }
+
+
+def _effects(spec: SceneSpec) -> dict[str, Any]:
+    return {effect.name: parameters(effect) for effect in spec.effects}
+
+
+def provenance(spec: SceneSpec) -> dict[str, Any]:
+    """How a scene was made, JSON-ready: the whole scene file as it was understood."""
+    record = {f.name: getattr(spec, f.name) for f in fields(spec) if f.name not in ("effects", "name", "seed")}
+    parts = {key: asdict(value) for key, value in record.items()}
+    return {"made_by": "spikerig sim capture", "scene_file": {**parts, "effects": _effects(spec)}}

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 from spikerig.dataset.errors import UsageError
 
 R = TypeVar("R")
+VECTORS = {"Vec3": "tuple[float, float, float]"}  # annotations are text here, so aliases are told by name
 
 
 def limits(
@@ -102,7 +103,7 @@ def _range(spec: dataclasses.Field) -> str:
 
 
 def _checked(value: Any, spec: dataclasses.Field, path: str, faults: Faults) -> Any:
-    kind = str(spec.type)
+    kind = VECTORS.get(str(spec.type), str(spec.type))
     fallback = None if spec.default is dataclasses.MISSING else spec.default
     if kind.startswith("tuple[float"):
         size = 0 if "..." in kind else kind.count("float")
