@@ -14,7 +14,7 @@ from spikerig.rigctl.sim.draws import stream
 from spikerig.rigctl.sim.effects import parameters
 from spikerig.rigctl.sim.light import Stage, stage_of
 from spikerig.rigctl.sim.orbit import orbit_pose, target_depth
-from spikerig.rigctl.sim.schedule import schedule
+from spikerig.rigctl.sim.schedule import Track, schedule, track_phases
 from spikerig.rigctl.sim.shake import ShakePath, shake_path
 from spikerig.rigctl.sim.spec import SceneSpec
 from spikerig.rigctl.sim.take import Rig, Taken, in_parallel, pack, share_of, surface, take_blurry, take_sharp
@@ -49,14 +49,15 @@ def take_view(spec: SceneSpec, number: int, stage: Stage | None = None) -> Taken
     rig, plan, path = rig_of(spec), schedule(spec.exposure), view_path(spec, number)
     label = path.poses(plan.label)[0]
     sharp = stage.picture(rig.camera, label, spec.lens.samples)
-    poses, name = path.poses(plan.poses_at()), f"{number:03d}"
+    phases, name = track_phases(plan), f"{number:03d}"
+    track = Track(phases, path.poses(phases))
     held_out = spec.orbit.held_out()
     if number in held_out:
-        return take_sharp(rig, number, name, plan, sharp, poses)
+        return take_sharp(rig, number, name, plan, sharp, track)
     rgb = np.empty((len(plan.phases), *sharp.shape), np.float32)
     for k, pose in enumerate(path.poses(plan.phases)):
         rgb[k] = sharp if plan.phases[k] == plan.label else stage.picture(rig.camera, pose, spec.lens.samples)
-    taken = take_blurry(rig, number, name, plan, sharp, poses, rgb)
+    taken = take_blurry(rig, number, name, plan, sharp, track, rgb)
     train = [k for k in range(spec.orbit.views) if k not in held_out]
     share = share_of(spec.cloud.count, train.index(number), len(train))
     depth = stage.depth(rig.camera, label)

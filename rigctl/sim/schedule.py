@@ -24,10 +24,19 @@ class Schedule:
     phases: NDArray[np.float64]
     label: float
 
-    def poses_at(self) -> NDArray[np.float64]:
-        """Phases of the trajectory's poses: the ends of the exposure, the pictures within it, and the label."""
-        within = self.phases[(self.phases >= 0) & (self.phases <= 1)]
-        return np.unique(np.concatenate([[0.0], within, [self.label, 1.0]]))
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """The camera over the exposure: increasing phases float64[N], cam_from_world float64[N,3,4]; the label is one."""
+
+    phases: NDArray[np.float64]
+    poses: NDArray[np.float64]
+
+
+def track_phases(plan: Schedule) -> NDArray[np.float64]:
+    """Phases of a track's poses: the ends of the exposure, the pictures within it, and the label."""
+    within = plan.phases[(plan.phases >= 0) & (plan.phases <= 1)]
+    return np.unique(np.concatenate([[0.0], within, [plan.label, 1.0]]))
 
 
 def schedule(exposure: Exposure) -> Schedule:

@@ -21,7 +21,7 @@ from spikerig.dataset.kernels import count
 from spikerig.dataset.scene import Camera, Frame, Points, Pose, Trajectory, Truth, View
 from spikerig.rigctl.sim.draws import stream
 from spikerig.rigctl.sim.effects import Effect, parameters
-from spikerig.rigctl.sim.schedule import Schedule, phase_ns, start_ns
+from spikerig.rigctl.sim.schedule import Schedule, Track, phase_ns, start_ns
 from spikerig.rigctl.sim.sensor import Light, encode
 from spikerig.rigctl.sim.simulate import simulate
 from spikerig.rigctl.sim.spec import Cloud, Exposure, Sensor
@@ -69,9 +69,7 @@ class Taken:
 NO_POINTS = Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), "simulator")
 
 
-def take_sharp(
-    rig: Rig, number: int, name: str, plan: Schedule, sharp: NDArray[np.float32], poses: NDArray[np.float64]
-) -> Taken:
+def take_sharp(rig: Rig, number: int, name: str, plan: Schedule, sharp: NDArray[np.float32], track: Track) -> Taken:
     """A view for testing: the sharp picture at the label, no spikes.
 
     Args:
@@ -79,9 +77,9 @@ def take_sharp(
         number, name: of the view.
         plan: its schedule.
         sharp: linear light float32[H,W,3] at the label.
-        poses: cam_from_world float64[N,3,4] at `plan.poses_at()`.
+        track: where the camera was.
     """
-    view, at_ns, path = _labelled(rig, number, name, plan, poses, "test")
+    view, at_ns, path = _labelled(rig, number, name, plan, track, "test")
     frame = Frame(encode(sharp), start_ns=at_ns)
     return Taken(replace(view, frame=frame), sharp, at_ns, path, NO_POINTS, np.nan, 0.0, 0)
 
@@ -92,17 +90,17 @@ def take_blurry(
     name: str,
     plan: Schedule,
     sharp: NDArray[np.float32],
-    poses: NDArray[np.float64],
+    track: Track,
     rgb: NDArray[np.float32],
 ) -> Taken:
     """A view for training: spikes over exposure and margins, and the blurry picture.
 
     Args:
-        rig, number, name, plan, sharp, poses: as for `take_sharp`.
+        rig, number, name, plan, sharp, track: as for `take_sharp`.
         rgb: linear light float32[K,H,W,3] at `plan.phases`.
     """
     exposure = rig.exposure
-    view, at_ns, path = _labelled(rig, number, name, plan, poses, "train")
+    view, at_ns, path = _labelled(rig, number, name, plan, track, "train")
     first = int(plan.knots[0])
     t0_ns = start_ns(exposure, number) + round(first * exposure.tick_ns)
     light = Light(rgb, plan.knots - first, (-first, exposure.ticks - first), exposure.rate_hz, t0_ns)
@@ -115,13 +113,13 @@ def take_blurry(
 
 
 def _labelled(
-    rig: Rig, number: int, name: str, plan: Schedule, poses: NDArray[np.float64], split: Any
+    rig: Rig, number: int, name: str, plan: Schedule, track: Track, split: Any
 ) -> tuple[View, int, Trajectory]:
     """A view without its picture yet, the instant of its label, its path."""
     height, width = rig.camera.height, rig.camera.width
-    begin, phases = start_ns(rig.exposure, number), plan.poses_at()
-    path = Trajectory(begin + phase_ns(rig.exposure, phases), poses)
-    pose = Pose(poses[int(np.searchsorted(phases, plan.label))])
+    begin = start_ns(rig.exposure, number)
+    path = Trajectory(begin + phase_ns(rig.exposure, track.phases), track.poses)
+    pose = Pose(track.poses[int(np.searchsorted(track.phases, plan.label))])
     rows = np.repeat(np.arange(height, dtype=np.float32)[:, None], width, 1)
     frame = Frame(np.zeros((height, width, 3), np.uint8))
     view = View(name, frame, None, rows, np.ones((height, width), bool), pose, None, split)
