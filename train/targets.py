@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from spikerig.dataset.clocktime import ClockModel
-from spikerig.dataset.errors import DataError
+from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.scene import Floats, View
 from spikerig.dataset.spikes import SpikeStream
 from spikerig.dataset.terminal import Progress
@@ -75,10 +75,12 @@ def spikes_of(view: View) -> SpikeStream:
 
 def truth_pose(scene: SceneFile, view: View) -> Floats:
     """The camera [3,4] at the instant of a view's sharp truth; its mid-exposure pose where no instant is given."""
-    at = scene.truth_at_ns(view.name)
-    if at is None or view.trajectory is None or len(view.trajectory.at_ns) < 2:
+    if view.trajectory is None or len(view.trajectory.at_ns) < 2:
         return view.pose.cam_from_world
-    return pose_at(view.trajectory, float(at))
+    try:
+        return pose_at(view.trajectory, float(scene.truth_at_ns(view.name)))
+    except UsageError:  # no instant given
+        return view.pose.cam_from_world
 
 
 def spike_tick(view: View, at_ns: float, clock: ClockModel | None) -> float:
