@@ -78,6 +78,8 @@ struct alignas(64) Footprint {
   float log2_opacity;      // alpha = 2^(log2_opacity - u^2 - v^2)
   float red, green, blue;  // not negative
   float reach_x, reach_y;  // half size of the box that holds every pixel with alpha >= ALPHA_MIN
+  float room;              // u^2 + v^2 on the rim, where alpha = ALPHA_MIN
+  float lean;              // dy of the rim's rightmost point; the leftmost is at -dy
 };
 static_assert(sizeof(Footprint) == 64);
 

@@ -48,7 +48,7 @@ void tiles(double centre, double reach, int pixels, uint16_t &first, uint16_t &l
 }
 
 struct Settled {  // what Footprint holds, for WIDE splats
-  vd x, y, p, r, s, log2_opacity, reach_x, reach_y;
+  vd x, y, p, r, s, log2_opacity, reach_x, reach_y, room, lean;
   vl seen;
 };
 
@@ -73,6 +73,8 @@ Settled settle(const Frame &frame, const Geometry &g, vl seen, int64_t first, in
   out.r = -unit * g.c12 / (root22 * root);
   out.s = unit / root22;
   out.log2_opacity = log_opacity * (1 / LN2);
+  out.room = room * (1 / LN2);
+  out.lean = reach * g.c12 / sqrt_lanes(g.c11);
   return out;
 }
 
@@ -113,6 +115,7 @@ bool project(Frame &frame, int64_t begin, int64_t end) {
       out.p = float(all.p[l]), out.r = float(all.r[l]), out.s = float(all.s[l]);
       out.log2_opacity = float(all.log2_opacity[l]);
       out.reach_x = float(all.reach_x[l]), out.reach_y = float(all.reach_y[l]);
+      out.room = float(all.room[l]), out.lean = float(all.lean[l]);
       if (!colour(frame, i, out)) return false;
     }
   }

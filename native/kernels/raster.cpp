@@ -24,17 +24,40 @@ Offsets offsets() {
   return out;
 }
 
-// Blocks that a box of this reach around (x, y), both from the tile's corner, can meet; one bit a block, row by row.
-inline uint64_t blocks_met(float x, float y, float reach_x, float reach_y) {
-  float left = x - reach_x - 0.5f, right = x + reach_x - 0.5f, top = y - reach_y - 0.5f, bottom = y + reach_y - 0.5f;
-  if (!(right >= 0 && bottom >= 0 && left <= TILE - 1 && top <= TILE - 1)) return 0;
-  int x0 = left > 0 ? static_cast<int>(left) / 4 : 0, x1 = right < TILE - 1 ? static_cast<int>(right) / 4 : 3;
-  int y0 = top > 0 ? static_cast<int>(top) / TALL : 0;
-  int y1 = bottom < TILE - 1 ? static_cast<int>(bottom) / TALL : BLOCK_ROWS - 1;
-  uint64_t columns = (2u << x1) - (1u << x0);
-  uint64_t every_row = 0x1111111111111111u;
-  every_row = (every_row >> (60 - 4 * (y1 - y0))) << 4 * y0;
-  return columns * every_row;
+constexpr int ROWS = BLOCK_ROWS < 8 ? BLOCK_ROWS : LANES;  // block rows looked at together
+typedef float rows_f __attribute__((vector_size(4 * ROWS)));
+typedef int32_t rows_i __attribute__((vector_size(4 * ROWS)));
+
+// Blocks that the rim alpha = ALPHA_MIN around (x, y), from the tile's corner, can meet; one bit a block, row by row.
+// For each block row: the rim's furthest right and left over that row's pixel centres, then the blocks between.
+inline uint64_t blocks_met(const Footprint &s, float x, float y) {
+  const float room = s.room * 1.0001f + 1e-4f, shrink = 1.0f / s.p, ss = s.s * s.s;
+  const float lean = s.r < 0 ? -s.r : s.r, off = y < 0 ? -y : y;
+  const float slack = 1e-3f + 1e-6f * (3 + lean * (off + TILE)) * shrink;  // above the rounding of what follows
+  const rows_f zero{}, lean_r = zero + s.lean, lean_l = zero - s.lean, last = zero + (TILE - 1);
+  uint64_t out = 0;
+  for (int first = 0; first < BLOCK_ROWS; first += ROWS) {
+    rows_f top, wide_r, wide_l;
+    rows_i place;
+    for (int j = 0; j < ROWS; ++j) top[j] = TALL * (first + j) + 0.5f, place[j] = 4 * j;
+    top -= y;
+    const rows_f bottom = top + (TALL - 1);
+    const rows_f yr = lean_r < top ? top : lean_r > bottom ? bottom : lean_r;
+    const rows_f yl = lean_l < top ? top : lean_l > bottom ? bottom : lean_l;
+    const rows_f free_r = room - ss * yr * yr, free_l = room - ss * yl * yl;
+    for (int j = 0; j < ROWS; ++j) wide_r[j] = __builtin_sqrtf(free_r[j]), wide_l[j] = __builtin_sqrtf(free_l[j]);
+    const rows_f right = (wide_r - s.r * yr) * shrink + (x - 0.5f + slack);
+    const rows_f left = (-wide_l - s.r * yl) * shrink + (x + 0.5f - slack);  // + 1: truncation rounds it up
+    const rows_i from = __builtin_convertvector(left > zero ? left : zero, rows_i) >> 2;
+    const rows_i to = __builtin_convertvector(right < last ? right : last, rows_i) >> 2;
+    rows_i columns = (((rows_i{} + 2) << to) - ((rows_i{} + 1) << from));
+    columns &= (free_r >= zero) & (right >= zero) & (left < zero + TILE) & (from <= to);
+    columns <<= place;
+    uint32_t bits = 0;
+    for (int j = 0; j < ROWS; ++j) bits |= static_cast<uint32_t>(columns[j]);
+    out |= static_cast<uint64_t>(bits) << 4 * first;
+  }
+  return out;
 }
 
 // Copies of the picture's channels for a tile, block by block; lanes outside the picture are 0.
@@ -74,7 +97,7 @@ void raster_tile(Frame &f, int tile) {
     if (k + AHEAD < end) __builtin_prefetch(&f.footprints.data[list[k + AHEAD].splat]);
     const Footprint &s = f.footprints.data[list[k].splat];
     const float x = static_cast<float>(s.x - c.x), y = static_cast<float>(s.y - c.y);
-    uint64_t todo = blocks_met(x, y, s.reach_x, s.reach_y) & live, touched = 0;
+    uint64_t todo = blocks_met(s, x, y) & live, touched = 0;
     for (; todo; todo &= todo - 1) {
       const int b = __builtin_ctzll(todo);
       const vf dx = at.x + (4 * (b % 4) - x), dy = at.y + (TALL * (b / 4) - y);
