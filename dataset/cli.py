@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import sys
 import tempfile
+from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points, version
 from pathlib import Path
 
 import typer
+
 from spikerig.dataset.errors import RigError, UsageError
 from spikerig.dataset.terminal import emit, note
 
@@ -45,7 +47,7 @@ def commands() -> dict[str, EntryPoint]:
     return found
 
 
-def _stub(name: str) -> typer.models.CommandFunctionType:  # type: ignore[name-defined]
+def _stub(name: str) -> Callable[[], None]:
     def stub() -> None:
         raise AssertionError(f"{name} was listed, not loaded")
 

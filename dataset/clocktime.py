@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
 from spikerig.dataset.errors import UsageError
 
 NS = 1_000_000_000

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
 from spikerig.dataset.clocktime import ClockModel, frozen_array
 from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.spikes import SpikeStream
@@ -214,7 +215,8 @@ class Scene:
     """A packaged RS-3D scene: one camera, views of it, sparse points, and (simulated scenes only) the truth.
 
     `light_gain` is the texture value (spikes a tick) of RGB white (linear 1.0): known for simulated scenes, measured
-    by calibration for real ones, None where unknown. `info` is free provenance, JSON-ready.
+    by calibration for real ones, None where unknown. `info` is free provenance, JSON-ready. `clock` is the take's map
+    of the spike camera's time to the rig's, `calibration` the rig's as a JSON-ready record; None where there is none.
     """
 
     name: str
@@ -224,6 +226,8 @@ class Scene:
     truth: Truth | None = None
     light_gain: float | None = None
     info: Mapping[str, Any] = field(default_factory=dict)
+    clock: ClockModel | None = None
+    calibration: Mapping[str, Any] | None = None
 
     def view(self, name: str) -> View:
         """The view of that name."""

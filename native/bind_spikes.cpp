@@ -1,8 +1,100 @@
+// Python's way to the spike kernels. Shapes that the C++ side relies on are checked here once more (a wrong one
+// would be a crash); the messages for people are in dataset/kernels.py.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 
-#include "dispatch.hpp"
+#include <stdexcept>
+
+#include "spike_kernels.hpp"
 
 namespace nb = nanobind;
+using namespace nb::literals;
 
-void bind_spikes(nb::module_ &m) { (void)m; }
+namespace {
+
+template <class T, class Shape>
+using In = nb::ndarray<const T, Shape, nb::c_contig, nb::device::cpu>;
+template <class T, class Shape>
+using Out = nb::ndarray<T, Shape, nb::c_contig, nb::device::cpu>;
+using Bits = In<uint8_t, nb::ndim<3>>;
+
+void need(bool fine, const char *what) {
+  if (!fine) throw std::invalid_argument(what);
+}
+
+spikerig::Packed packed(const Bits &bits, int64_t width) {
+  const spikerig::Packed s{bits.data(), static_cast<int64_t>(bits.shape(0)), static_cast<int64_t>(bits.shape(1)),
+                           width};
+  need(width >= 1 && static_cast<int64_t>(bits.shape(2)) == s.row(), "bits must be uint8[T,H,ceil(W/8)]");
+  return s;
+}
+
+template <class Array>
+bool image(const Array &a, const spikerig::Packed &s) {
+  return static_cast<int64_t>(a.shape(0)) == s.height && static_cast<int64_t>(a.shape(1)) == s.width;
+}
+
+template <class Array>
+bool movie(const Array &a, const spikerig::Packed &s) {
+  return static_cast<int64_t>(a.shape(0)) == s.ticks && static_cast<int64_t>(a.shape(1)) == s.height &&
+         static_cast<int64_t>(a.shape(2)) == s.width;
+}
+
+void unpack(Bits bits, int64_t width, Out<uint8_t, nb::ndim<3>> out) {
+  const auto s = packed(bits, width);
+  need(movie(out, s), "out must be uint8[T,H,W]");
+  nb::gil_scoped_release release;
+  DISPATCH(unpack, s, out.data());
+}
+
+void count(Bits bits, int64_t width, int64_t t0, int64_t t1, Out<uint32_t, nb::ndim<2>> out) {
+  const auto s = packed(bits, width);
+  need(0 <= t0 && t0 <= t1 && t1 <= s.ticks && t1 - t0 <= UINT32_MAX, "the window must lie in the stream");
+  need(image(out, s), "out must be uint32[H,W]");
+  nb::gil_scoped_release release;
+  DISPATCH(count, s, t0, t1, out.data());
+}
+
+void tfi_at(Bits bits, int64_t width, int64_t tick, int before, int after, Out<int32_t, nb::ndim<2>> previous,
+            Out<int32_t, nb::ndim<2>> next) {
+  const auto s = packed(bits, width);
+  need(0 <= tick && tick <= s.ticks && s.ticks <= INT32_MAX, "the tick must lie in the stream");
+  need(before >= 1 && after >= 1, "ranks start at 1");
+  need(image(previous, s) && image(next, s), "previous and next must be int32[H,W]");
+  nb::gil_scoped_release release;
+  DISPATCH(tfi_at, s, tick, before, after, previous.data(), next.data());
+}
+
+void tfi_all(Bits bits, int64_t width, Out<uint16_t, nb::ndim<3>> out) {
+  const auto s = packed(bits, width);
+  need(movie(out, s), "out must be uint16[T,H,W]");
+  nb::gil_scoped_release release;
+  DISPATCH(tfi_all, s, out.data());
+}
+
+void fire(In<float, nb::ndim<3>> rows, In<int64_t, nb::ndim<1>> knots, bool hold, Out<uint32_t, nb::ndim<2>> charge,
+          Out<uint8_t, nb::ndim<3>> bits, Out<double, nb::ndim<2>> clipped) {
+  const auto count = static_cast<int64_t>(knots.shape(0));
+  need(count >= 1, "at least one knot");
+  const spikerig::Light light{rows.data(), knots.data(), count - 1, static_cast<int64_t>(rows.shape(1)),
+                              static_cast<int64_t>(rows.shape(2)), hold};
+  need(static_cast<int64_t>(rows.shape(0)) >= (hold ? count - 1 : count), "too few light rows");
+  for (int64_t k = 1; k < count; ++k) need(knots.data()[k] >= knots.data()[k - 1], "knots must not decrease");
+  const spikerig::Packed s{bits.data(), static_cast<int64_t>(bits.shape(0)), light.height, light.width};
+  need(light.width >= 1 && static_cast<int64_t>(bits.shape(1)) == s.height &&
+           static_cast<int64_t>(bits.shape(2)) == s.row() && s.ticks == knots.data()[count - 1] - knots.data()[0],
+       "bits must be uint8[T,H,ceil(W/8)] with T the span of the knots");
+  need(image(charge, s) && image(clipped, s), "charge and clipped must be [H,W]");
+  nb::gil_scoped_release release;
+  DISPATCH(fire, light, charge.data(), bits.data(), clipped.data());
+}
+
+}  // namespace
+
+void bind_spikes(nb::module_ &m) {
+  m.def("unpack", &unpack, "bits"_a, "width"_a, "out"_a);
+  m.def("count", &count, "bits"_a, "width"_a, "t0"_a, "t1"_a, "out"_a);
+  m.def("tfi_at", &tfi_at, "bits"_a, "width"_a, "tick"_a, "before"_a, "after"_a, "previous"_a, "next"_a);
+  m.def("tfi_all", &tfi_all, "bits"_a, "width"_a, "out"_a);
+  m.def("fire", &fire, "light"_a, "knots"_a, "hold"_a, "charge"_a, "bits"_a, "clipped"_a);
+}

@@ -9,6 +9,7 @@ namespace nb = nanobind;
 
 void bind_spikes(nb::module_ &m);
 void bind_train(nb::module_ &m);
+void bind_light(nb::module_ &m);
 
 NB_MODULE(_native, m) {
   m.doc() = "spikerig's native kernels. Call them through dataset.kernels and train.kernels, which check shapes.";
@@ -19,4 +20,5 @@ NB_MODULE(_native, m) {
   m.def("set_threads", &spikerig::set_threads, nb::arg("n"), "Set the thread team's size (1..256).");
   bind_spikes(m);
   bind_train(m);
+  bind_light(m);
 }

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
 from spikerig import _native
 from spikerig.dataset.errors import NumericsError, UsageError
 

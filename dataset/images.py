@@ -1,0 +1,309 @@
+"""Pictures on disk (PNG, JPEG, OpenEXR) and the sRGB curve. PNG and JPEG hold encoded pixels, EXR holds linear light.
+
+What the libraries get wrong is put right here: cv2's BGR order, OpenEXR's silently wrong pixels for any array that is
+not contiguous and its truncated files that open "successfully" with a part missing.
+"""
+
+from __future__ import annotations
+
+import os
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from spikerig.dataset.errors import DataError, NumericsError, UsageError
+from spikerig.dataset.texture import Texture
+
+MAX_PIXELS = 1 << 28
+SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
+_PNG_START = b"\x89PNG\r\n\x1a\n"
+_EXR_START = b"\x76\x2f\x31\x01"
+
+
+def srgb_from_linear(light: ArrayLike) -> NDArray[np.floating]:
+    """Encode linear light by the exact piecewise sRGB curve.
+
+    Args:
+        light: any shape, 1.0 = display white.
+
+    Returns:
+        The encoded values; float32 stays float32, anything else becomes float64.
+
+    Edges:
+        Nothing is clipped: negative light follows the straight segment, light above 1 the power; NaN stays NaN.
+
+    Source: IEC 61966-2-1.
+    """
+    x = _floats(light)
+    power = np.power(np.maximum(x, 0.0031308), 1 / 2.4) * 1.055 - 0.055
+    return np.where(x <= 0.0031308, x * 12.92, power).astype(x.dtype)
+
+
+def linear_from_srgb(pixels: ArrayLike) -> NDArray[np.floating]:
+    """Decode sRGB values in [0, 1] to linear light; the inverse of `srgb_from_linear`, same edges, same dtypes.
+
+    Args:
+        pixels: any shape, floats; uint8 and uint16 are divided by 255 and 65535 first and give float32.
+    """
+    x = _floats(pixels)
+    power = np.power((np.maximum(x, 0.04045) + 0.055) / 1.055, 2.4)
+    return np.where(x <= 0.04045, x / 12.92, power).astype(x.dtype)
+
+
+def srgb8_from_linear(light: ArrayLike) -> NDArray[np.uint8]:
+    """8-bit sRGB pixels of linear light: clipped to [0, 1], encoded, rounded to the nearest of 255 steps.
+
+    Raises:
+        NumericsError: the light holds NaN.
+    """
+    encoded = srgb_from_linear(light)
+    if np.isnan(encoded).any():
+        raise NumericsError("light to be encoded holds NaN", value=f"{int(np.isnan(encoded).sum())} values")
+    return np.rint(np.clip(encoded, 0, 1) * 255).astype(np.uint8)
+
+
+def _floats(values: ArrayLike) -> NDArray[np.floating]:
+    x = np.asarray(values)
+    if x.dtype == np.uint8:
+        return x.astype(np.float32) / np.float32(255)
+    if x.dtype == np.uint16:
+        return x.astype(np.float32) / np.float32(65535)
+    return x if x.dtype == np.float32 else x.astype(np.float64)
+
+
+def read_image(path: str | Path, *, nonfinite: str = "error") -> NDArray[Any]:
+    """Read a picture as it is stored.
+
+    Args:
+        path: .png (8 or 16 bit), .jpg or .exr.
+        nonfinite: "error", or "keep" to let NaN and infinities of an EXR through.
+
+    Returns:
+        uint8 or uint16 [H,W,C], encoded, from PNG and JPEG; float32 [H,W,C], linear, from EXR; C is 1, 3 or 4,
+        in the order R, G, B, A.
+
+    Raises:
+        DataError: not a picture, damaged, truncated, too large, or of a kind not handled.
+        NumericsError: an EXR holds NaN or infinities.
+
+    Edges:
+        An EXR is returned on its display window; where its data window leaves pixels unsaid they are 0.
+        Of a multi-part EXR the first flat part with RGB, RGBA or Y is read. A JPEG's rotation tag is ignored.
+    """
+    source = Path(path)
+    start = _start(source)
+    if start.startswith(_EXR_START):
+        return _read_exr(source, nonfinite)
+    if start.startswith(_PNG_START):
+        data = source.read_bytes()
+        _check_png(source, data)
+    elif start.startswith(b"\xff\xd8\xff"):
+        data = source.read_bytes()
+        if data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
+            raise _damaged(source, "the JPEG has no end marker")
+    else:
+        raise DataError("not a picture this tool reads", value=source, expected="PNG, JPEG or OpenEXR")
+    import cv2
+
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise _damaged(source, str(error)) from error
+    if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
+        raise _damaged(source, "its pixels cannot be decoded")
+    if pixels.ndim == 2:
+        return pixels[:, :, None]
+    order = [2, 1, 0, 3][: pixels.shape[2]]
+    return np.ascontiguousarray(pixels[:, :, order])
+
+
+def read_linear(path: str | Path, *, background: float | None = None) -> NDArray[np.float32]:
+    """Read any picture as linear light, float32[H,W,3]; gray is repeated, alpha is laid over `background`.
+
+    Args:
+        path: as for `read_image`.
+        background: linear gray level behind transparent pixels; needed where the picture has alpha.
+
+    Raises:
+        UsageError: there is alpha and no background.
+        DataError, NumericsError: as `read_image`.
+
+    Edges:
+        Straight alpha of an encoded picture is composited on encoded values, as NeRF's data sets are; an EXR's
+        alpha is premultiplied, as its standard says.
+    """
+    pixels = read_image(path)
+    linear = pixels.dtype == np.float32
+    colour = _floats(pixels)
+    if colour.shape[2] == 1:
+        colour = np.repeat(colour, 3, axis=2)
+    if colour.shape[2] == 4:
+        if background is None:
+            raise UsageError("the picture has alpha: say what lies behind it", value=path, next="give a background")
+        alpha, colour = colour[:, :, 3:], colour[:, :, :3]
+        behind = background if linear else float(srgb_from_linear(background))
+        colour = colour * (1 if linear else alpha) + behind * (1 - alpha)
+    return np.asarray(colour if linear else linear_from_srgb(colour), np.float32)
+
+
+def write_image(path: str | Path, pixels: ArrayLike, *, force: bool = False) -> None:
+    """Write a picture: .png from uint8 or uint16 (encoded), .exr from floats (linear, stored as float32, ZIP).
+
+    Args:
+        path: ends in .png or .exr; appears whole or not at all.
+        pixels: [H,W], [H,W,1], [H,W,3] or [H,W,4], in the order R, G, B, A; any memory layout.
+        force: replace an existing file.
+
+    Raises:
+        UsageError: the file exists, or the ending and the dtype do not fit together.
+    """
+    target = Path(path)
+    array = np.asarray(pixels)
+    array = array[:, :, None] if array.ndim == 2 else array
+    if array.ndim != 3 or array.shape[2] not in (1, 3, 4) or array.size == 0:
+        raise UsageError("a picture is [H,W], [H,W,1], [H,W,3] or [H,W,4]", value=array.shape)
+    whole = array.dtype in (np.uint8, np.uint16)
+    if target.suffix.lower() not in (".png", ".exr") or whole == (target.suffix.lower() == ".exr"):
+        raise UsageError(
+            "a picture's ending must fit its numbers",
+            value=f"{target.name}, {array.dtype}",
+            expected=".png for uint8 or uint16 (encoded), .exr for floats (linear)",
+        )
+    if target.exists() and not force:
+        raise UsageError("the picture exists already", value=target, next="give --force to replace it")
+    part = target.with_name(f".{target.stem}.{os.getpid()}.partial{target.suffix}")
+    try:
+        (_write_png if whole else _write_exr)(part, array)
+        os.replace(part, target)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def texture_png(path: str | Path, texture: Texture, gain: float | None = None, *, force: bool = False) -> float:
+    """Write a texture as an 8-bit PNG, sRGB(gain * light); pixels not known are transparent.
+
+    Args:
+        path: of the PNG.
+        texture: light float32[H,W] and known bool[H,W].
+        gain: None takes the one that lifts the 99th percentile of known light to white.
+        force: replace an existing file.
+
+    Returns:
+        The gain used: print it.
+    """
+    if gain is None:
+        lit = texture.light[texture.known]
+        top = float(np.percentile(lit, 99)) if lit.size else 0.0
+        gain = 1 / top if top > 0 else 1.0
+    gray = srgb8_from_linear(np.where(texture.known, texture.light, 0) * np.float32(gain))
+    if not texture.known.all():
+        gray = np.dstack([gray, gray, gray, np.where(texture.known, 255, 0).astype(np.uint8)])
+    write_image(path, gray, force=force)
+    return gain
+
+
+def _write_png(path: Path, array: NDArray[Any]) -> None:
+    import cv2
+
+    order = {1: [0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}[array.shape[2]]
+    done, data = cv2.imencode(".png", np.ascontiguousarray(array[:, :, order]))
+    if not done:
+        raise DataError("the picture could not be encoded", value=path)
+    path.write_bytes(data.tobytes())
+
+
+def _write_exr(path: Path, array: NDArray[Any]) -> None:
+    import OpenEXR
+
+    pixels = np.ascontiguousarray(array, np.float32)  # OpenEXR writes wrong pixels from any other layout
+    name = {1: "Y", 3: "RGB", 4: "RGBA"}[pixels.shape[2]]
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, {name: pixels[:, :, 0].copy() if name == "Y" else pixels}).write(str(path))
+
+
+def _start(path: Path) -> bytes:
+    try:
+        if not path.is_file():
+            raise DataError("not a file", value=path, expected="a PNG, JPEG or OpenEXR picture")
+        with path.open("rb") as file:
+            return file.read(8)
+    except OSError as error:
+        raise DataError("the picture cannot be opened", value=f"{path}: {error.strerror}") from error
+
+
+def _damaged(path: Path, cause: str) -> DataError:
+    return DataError("the picture is damaged", value=path, cause=cause, next="copy or export it again")
+
+
+def _check_png(path: Path, data: bytes) -> None:
+    """Walk a PNG's chunks: sizes, checksums, the end; libpng may return part of a picture without a word."""
+    at, kind = len(_PNG_START), b""
+    while at < len(data) and kind != b"IEND":
+        size, kind = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]
+        body = data[at + 8 : at + 8 + size]
+        if len(body) != size or zlib.crc32(body, zlib.crc32(kind)) != int.from_bytes(
+            data[at + 8 + size : at + 12 + size], "big"
+        ):
+            raise _damaged(path, f"the PNG breaks off or is corrupt at byte {at}")
+        if kind == b"IHDR" and size == 13:
+            _check_size(path, int.from_bytes(body[:4], "big"), int.from_bytes(body[4:8], "big"))
+        at += 12 + size
+    if kind != b"IEND":
+        raise _damaged(path, "the PNG has no end")
+
+
+def _check_size(path: Path, width: int, height: int) -> None:
+    if width < 1 or height < 1 or width * height > MAX_PIXELS:
+        raise DataError("the picture's claimed size is refused", value=f"{path}: {width} x {height}")
+
+
+def _read_exr(path: Path, nonfinite: str) -> NDArray[np.float32]:
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), header_only=True) as head:
+            claimed = [dict(part.header) for part in head.parts]  # emptied on leaving the `with`
+        for header in claimed:
+            (x0, y0), (x1, y1) = np.asarray(header["dataWindow"], np.int64).tolist()
+            _check_size(path, x1 - x0 + 1, y1 - y0 + 1)
+            (x0, y0), (x1, y1) = np.asarray(header["displayWindow"], np.int64).tolist()
+            _check_size(path, x1 - x0 + 1, y1 - y0 + 1)
+        with OpenEXR.File(str(path)) as file:
+            parts = [(dict(p.header), {name: np.array(c.pixels) for name, c in p.channels.items()}) for p in file.parts]
+    except DataError:
+        raise
+    except Exception as error:  # the binding raises RuntimeError, ValueError, TypeError, as it comes
+        raise _damaged(path, str(error)) from error
+    if not parts or len(parts) != len(claimed):  # a part whose pixels fail is dropped with a word on stderr
+        raise _damaged(path, f"{len(claimed) - len(parts)} of {len(claimed)} parts cannot be read: truncated?")
+    for header, channels in parts:
+        for name in ("RGBA", "RGB", "Y"):
+            if name in channels and not {"RY", "BY"} & channels.keys() and channels[name].dtype != object:
+                return _on_display(path, header, channels[name], nonfinite)
+    raise DataError(
+        "no RGB, RGBA or Y picture in this EXR",
+        value=f"{path}: " + "; ".join(", ".join(channels) for _, channels in parts),
+        cause="luminance-chroma, deep, or multi-view by channel names: not handled",
+        next="convert it to RGB, e.g. with oiiotool",
+    )
+
+
+def _on_display(path: Path, header: dict[str, Any], pixels: NDArray[Any], nonfinite: str) -> NDArray[np.float32]:
+    pixels = np.asarray(pixels, np.float32)
+    pixels = pixels[:, :, None] if pixels.ndim == 2 else pixels
+    bad = int((~np.isfinite(pixels)).sum())
+    if bad and nonfinite != "keep":
+        raise NumericsError("the EXR holds NaN or infinite values", value=f"{path}: {bad} of {pixels.size}")
+    (ax, ay), (bx, by) = np.asarray(header["dataWindow"], np.int64).tolist()
+    (cx, cy), (dx, dy) = np.asarray(header["displayWindow"], np.int64).tolist()
+    if (ax, ay, bx, by) == (cx, cy, dx, dy):
+        return np.ascontiguousarray(pixels)
+    left, top, right, bottom = max(ax, cx), max(ay, cy), min(bx, dx) + 1, min(by, dy) + 1
+    if left >= right or top >= bottom:
+        raise DataError("the EXR's pixels lie wholly outside its display window", value=path)
+    out = np.zeros((dy - cy + 1, dx - cx + 1, pixels.shape[2]), np.float32)
+    out[top - cy : bottom - cy, left - cx : right - cx] = pixels[top - ay : bottom - ay, left - ax : right - ax]
+    return out

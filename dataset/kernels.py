@@ -1,0 +1,194 @@
+"""The native spike kernels behind checked calls; `oracles` holds a readable function of the same name for each.
+
+Packed spikes are uint8[T,H,ceil(W/8)]: top row first, rows padded to bytes, LSB first (pixel x is bit x%8 of byte
+x//8). Every kernel returns the same bits on every instruction set and for any number of threads.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spikerig import _native
+from spikerig.dataset.errors import NumericsError, UsageError
+
+Bits = NDArray[np.uint8]
+MAX_LIGHT = float(2**18)  # thresholds a tick: fixed-point light stays exact in a float64
+
+
+def unpack(bits: Bits, width: int) -> NDArray[np.uint8]:
+    """One byte a pixel.
+
+    Args:
+        bits: uint8[T,H,ceil(W/8)] packed spikes.
+        width: W.
+
+    Returns:
+        uint8[T,H,W], 0 or 1.
+
+    Raises:
+        UsageError: `bits` is not packed spikes of that width.
+
+    Cost:
+        Writes T*H*W bytes; memory-bound.
+    """
+    bits = _packed(bits, width)
+    out = np.empty((*bits.shape[:2], width), np.uint8)
+    _native.unpack(bits, width, out)
+    return out
+
+
+def count(bits: Bits, width: int, t0: int, t1: int) -> NDArray[np.uint32]:
+    """Spikes a pixel in the half-open window [t0, t1).
+
+    Args:
+        bits: uint8[T,H,ceil(W/8)] packed spikes.
+        width: W.
+        t0, t1: ticks, 0 <= t0 <= t1 <= T.
+
+    Returns:
+        uint32[H,W].
+
+    Raises:
+        UsageError: the window leaves the stream, or `bits` is not packed spikes of that width.
+
+    Edges:
+        An empty window counts zero.
+
+    Cost:
+        Reads the window once without unpacking it, about 5 operations a vector of 512 (or 256) pixels and tick.
+    """
+    bits = _packed(bits, width)
+    if not 0 <= t0 <= t1 <= len(bits):
+        raise UsageError("a window must lie in the stream", value=f"[{t0}, {t1})", expected=f"within [0, {len(bits)})")
+    out = np.empty((bits.shape[1], width), np.uint32)
+    _native.count(bits, width, t0, t1, out)
+    return out
+
+
+def tfi_at(
+    bits: Bits, width: int, tick: int, *, before: int = 1, after: int = 1
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """The spikes around an instant.
+
+    Args:
+        bits: uint8[T,H,ceil(W/8)] packed spikes.
+        width: W.
+        tick: the instant, 0 <= tick <= T.
+        before: which spike before the instant: 1 the last, 2 the one before it, ...
+        after: which spike at or after the instant: 1 the first, ...
+
+    Returns:
+        (previous, next) int32[H,W] each: the tick of the `before`-th last spike < tick and of the `after`-th first
+        spike >= tick; -1 where there is none.
+
+    Raises:
+        UsageError: the tick leaves the stream, a rank is < 1, or `bits` is not packed spikes of that width.
+
+    Cost:
+        Scans outward and stops, 64 pixels at a time, once all of them are found; a dark pixel costs its 64
+        neighbours a look at every tick.
+    """
+    bits = _packed(bits, width)
+    if not 0 <= tick <= len(bits):
+        raise UsageError("an instant must lie in the stream", value=tick, expected=f"0 .. {len(bits)}")
+    if before < 1 or after < 1:
+        raise UsageError("spikes around an instant are counted from 1", value=(before, after))
+    previous, following = (np.empty((bits.shape[1], width), np.int32) for _ in range(2))
+    _native.tfi_at(bits, width, tick, before, after, previous, following)
+    return previous, following
+
+
+def tfi_all(bits: Bits, width: int) -> NDArray[np.uint16]:
+    """The enclosing inter-spike interval at every tick.
+
+    Args:
+        bits: uint8[T,H,ceil(W/8)] packed spikes.
+        width: W.
+
+    Returns:
+        uint16[T,H,W]: b - a for the last spike a < t and the first spike b >= t; 0 where either is missing.
+
+    Raises:
+        UsageError: `bits` is not packed spikes of that width.
+
+    Edges:
+        Intervals of 65535 ticks and more read 65535.
+
+    Cost:
+        Writes T*H*W*2 bytes twice; memory-bound.
+    """
+    bits = _packed(bits, width)
+    out = np.empty((*bits.shape[:2], width), np.uint16)
+    _native.tfi_all(bits, width, out)
+    return out
+
+
+def fire(
+    light: NDArray[np.float32], knots: NDArray[np.int64], charge: NDArray[np.uint32], *, hold: bool
+) -> tuple[Bits, NDArray[np.uint32], NDArray[np.float64]]:
+    """Integrate light and fire a spike at every threshold.
+
+    Args:
+        light: float32[K,H,W], thresholds a tick at the knots.
+        knots: int64, ticks, strictly increasing. Ramps (hold=False): K knots, light linear between them and taken at
+            the middle of each tick. Steps (hold=True): light[k] holds for ticks [knots[k], knots[k+1]), with K + 1
+            knots (or K: then the last light row is not used).
+        charge: uint32[H,W] at the start, in 2^-32 of a threshold; left as it is.
+        hold: steps instead of ramps.
+
+    Returns:
+        (bits uint8[T,H,ceil(W/8)], charge uint32[H,W] at the end, clipped float64[H,W] in thresholds), with
+        T = knots[-1] - knots[0].
+
+    Raises:
+        NumericsError: light is negative, not finite, or above 2^18 thresholds a tick.
+        UsageError: shapes or knots that do not fit.
+
+    Edges:
+        Light of one threshold a tick or more fires every tick; what is above one is clipped and counted. The sum of
+        light = spikes + (charge after - charge before)/2^32 + clipped, exactly in units of 2^-32 (clipped to 2^53
+        units). T = 0 gives no bits and the charge unchanged.
+
+    Cost:
+        About half an operation a pixel and tick with AVX-512 below one threshold a tick, some ten times that above.
+
+    Source:
+        Integrate-and-fire with the surplus kept, Eq. 5-6 of the paper; definition in `oracles.fire`.
+    """
+    light = np.ascontiguousarray(light, np.float32)
+    knots = np.ascontiguousarray(knots, np.int64)
+    if light.ndim != 3 or knots.ndim != 1 or charge.shape != light.shape[1:] or light.shape[2] < 1:
+        raise UsageError(
+            "light is [K,H,W], knots [K], charge [H,W]", value=(light.shape, knots.shape, np.shape(charge))
+        )
+    fits = (len(light), len(light) + 1) if hold else (len(light),)
+    if len(knots) not in fits or len(knots) < 1 or np.any(np.diff(knots) <= 0):
+        raise UsageError(
+            "knots must increase strictly, one for each row of light",
+            value=knots[:8],
+            expected=f"{' or '.join(map(str, fits))} of them",
+        )
+    if light.size:
+        low, high = float(light.min()), float(light.max())
+        if not (low >= 0 and high <= MAX_LIGHT):  # also catches NaN
+            raise NumericsError(
+                "light must be finite, not negative, and not absurdly bright",
+                value=f"between {low} and {high} thresholds a tick",
+                expected=f"0 .. {MAX_LIGHT:.0f}",
+                cause="a division by zero, or light in other units than thresholds a tick",
+            )
+    if charge.dtype != np.uint32:
+        raise UsageError("charge is uint32, in 2^-32 of a threshold", value=charge.dtype)
+    height, width = light.shape[1:]
+    left = np.array(charge, np.uint32, order="C")
+    bits = np.empty((int(knots[-1] - knots[0]), height, (width + 7) // 8), np.uint8)
+    clipped = np.empty((height, width), np.float64)
+    _native.fire(light, knots, hold, left, bits, clipped)
+    return bits, left, clipped
+
+
+def _packed(bits: Bits, width: int) -> Bits:
+    if width < 1 or bits.ndim != 3 or bits.dtype != np.uint8 or bits.shape[2] != (width + 7) // 8:
+        raise UsageError("packed spikes are uint8[T,H,ceil(W/8)]", value=(bits.shape, str(bits.dtype), width))
+    return np.ascontiguousarray(bits)

@@ -1,0 +1,89 @@
+"""What each spike kernel computes, in a few lines of NumPy: the definitions, and the referees of the tests.
+
+Same names, arguments and results as in `kernels`, without its checks and without its speed.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Bits = NDArray[np.uint8]
+
+
+def unpack(bits: Bits, width: int) -> NDArray[np.uint8]:
+    """One byte a pixel: uint8[T,H,W]."""
+    return np.unpackbits(bits, axis=2, bitorder="little")[:, :, :width]
+
+
+def pack(spikes: NDArray) -> Bits:
+    """The inverse of `unpack`: bool or 0/1 [T,H,W] to uint8[T,H,ceil(W/8)], padding bits zero."""
+    return np.packbits(spikes != 0, axis=2, bitorder="little")
+
+
+def count(bits: Bits, width: int, t0: int, t1: int) -> NDArray[np.uint32]:
+    """Spikes a pixel in [t0, t1): uint32[H,W]."""
+    return unpack(bits[t0:t1], width).sum(0, dtype=np.uint32)
+
+
+def tfi_at(
+    bits: Bits, width: int, tick: int, *, before: int = 1, after: int = 1
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Ticks of the `before`-th last spike < tick and the `after`-th first spike >= tick, -1 where there is none."""
+    spikes = unpack(bits, width)
+
+    def nth(run: NDArray[np.uint8], n: int) -> NDArray[np.intp]:
+        seen = run.cumsum(0, dtype=np.int64) >= n
+        return np.where(seen.any(0), seen.argmax(0), -1) if len(run) else np.full(run.shape[1:], -1)
+
+    back, forth = nth(spikes[:tick][::-1], before), nth(spikes[tick:], after)
+    previous, following = np.where(back < 0, -1, tick - 1 - back), np.where(forth < 0, -1, tick + forth)
+    return previous.astype(np.int32), following.astype(np.int32)
+
+
+def tfi_all(bits: Bits, width: int) -> NDArray[np.uint16]:
+    """The enclosing interval at every tick: uint16[T,H,W], 0 where not known, 65535 and more as 65535."""
+    out = np.zeros((*bits.shape[:2], width), np.uint16)
+    for tick in range(len(bits)):
+        a, b = tfi_at(bits, width, tick)
+        out[tick] = np.where((a < 0) | (b < 0), 0, np.minimum(b - a, 65535))
+    return out
+
+
+def fixed_light(light: NDArray[np.float32], knots: NDArray[np.int64], *, hold: bool) -> NDArray[np.int64]:
+    """The light of every tick in units of 2^-32 threshold, as `fire` integrates it: int64[T,H,W].
+
+    A ramp from a to b over n ticks, both rounded to units, gives tick j floor(a + D/2 + j D) with D = (b - a)/n; D and
+    D/2 are rounded to 2^-32 of a unit, so that the light of a million ticks is right to a quarter of a unit.
+    """
+    unit = 2.0**32
+    rows = [np.zeros((0, *light.shape[1:]), np.int64)]
+    for k in range(len(knots) - 1):
+        n = int(knots[k + 1] - knots[k])
+        a = np.rint(light[k].astype(np.float64) * unit)
+        b = a if hold else np.rint(light[k + 1].astype(np.float64) * unit)
+        slope = (b - a) * (1.0 / n)
+        step, step_low = _parts(slope)
+        start, start_low = _parts(slope * 0.5)
+        j = np.arange(n, dtype=np.int64)[:, None, None]
+        rows.append(a.astype(np.int64) + start + j * step + ((start_low + j * step_low) >> 32))
+    return np.concatenate(rows)
+
+
+def _parts(x: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    whole = np.rint(x)
+    return whole.astype(np.int64), np.rint((x - whole) * 2.0**32).astype(np.int64)
+
+
+def fire(
+    light: NDArray[np.float32], knots: NDArray[np.int64], charge: NDArray[np.uint32], *, hold: bool
+) -> tuple[Bits, NDArray[np.uint32], NDArray[np.float64]]:
+    """Integrate and fire, in closed form: spikes so far = floor of the charge so far, in thresholds.
+
+    Every tick adds at most one threshold; what light is above that is clipped.
+    """
+    every = fixed_light(light, knots, hold=hold)
+    taken = np.minimum(every, 2**32)
+    total = charge.astype(np.int64) + np.concatenate([np.zeros_like(taken[:1]), taken]).cumsum(0)[: len(taken) + 1]
+    fired = np.diff(total >> 32, axis=0)
+    return pack(fired), (total[-1] & 0xFFFFFFFF).astype(np.uint32), (every - taken).sum(0) / 2.0**32

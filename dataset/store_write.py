@@ -1,0 +1,353 @@
+"""Writing a scene file, a view at a time: it appears at its name complete, or not at all.
+
+The file grows beside its target as NAME.partial with status "recording", flushed after each view. `close` sets
+"complete", syncs and renames. An exception sets "aborted" and keeps the part if it holds a view (it may be the only
+record of a capture), else removes it. A kill leaves status "recording". Reading either is a clear error unless asked.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike
+
+from spikerig.dataset.clocktime import ClockModel
+from spikerig.dataset.errors import HostError, NumericsError, UsageError
+from spikerig.dataset.hdf5_guard import MAX_TEXT, member, names, remember
+from spikerig.dataset.scene import Camera, Points, Scene, Trajectory, Truth, View
+from spikerig.dataset.store import DIGEST, FORMAT, NAME, VERSION, row_of, stored_digest
+from spikerig.dataset.terminal import jsonable
+
+_BLOCK = 1 << 24
+
+
+@contextmanager
+def disk_faults(path: Path) -> Iterator[None]:
+    """Turn what HDF5 raises on a full or failing disk into one HostError."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        raise HostError("the scene cannot be written", value=f"{path}: {error}", cause="a full disk?") from error
+
+
+class SceneWriter:
+    """Write a scene in bounded memory; use it in a `with`, which closes it, or aborts it on an exception.
+
+    Args:
+        path: of the scene file.
+        name, camera: of the scene.
+        light_gain, info, points, clock, calibration: as in Scene; also settable as attributes until closing.
+        truth: its clock, effects, seed and label (its mappings are written too); None for a real scene.
+        force: replace an existing file, and an unfinished part of an earlier try.
+
+    Raises:
+        UsageError: the file, or an unfinished part of it, exists.
+        HostError: the folder cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        name: str,
+        camera: Camera,
+        *,
+        light_gain: float | None = None,
+        info: Mapping[str, Any] | None = None,
+        points: Points | None = None,
+        clock: ClockModel | None = None,
+        calibration: Mapping[str, Any] | None = None,
+        truth: Truth | None = None,
+        force: bool = False,
+    ) -> None:
+        self.path, self.name, self.camera, self.truth, self.force = Path(path), name, camera, truth, force
+        self.light_gain, self.info, self.points = light_gain, dict(info or {}), points
+        self.clock, self.calibration = clock, calibration
+        self.part = self.path.with_name(self.path.name + ".partial")
+        self.names: list[str] = []
+        self._file = self._create()
+        root = self._file
+        for key, value in (("format", FORMAT), ("version", VERSION), ("status", "recording"), ("name", name)):
+            put_attr(root, key, value)
+        put_attr(root, "writer", f"spikerig {version('spikerig')}")
+        group = root.create_group("camera")
+        put_attr(group, "width", camera.width)
+        put_attr(group, "height", camera.height)
+        put(group, "K", camera.K)
+        put(group, "distortion", camera.distortion)
+        self._views = root.create_group("views")
+        if truth is not None:
+            self._put_truth(truth)
+        root.flush()
+
+    def _create(self) -> h5py.File:
+        if self.path.is_dir() or (self.path.exists() and not self.force):
+            raise UsageError("the scene exists already", value=self.path, next="give --force to replace it")
+        if self.part.exists() and not self.force:
+            raise UsageError(
+                "an unfinished scene lies in the way",
+                value=self.part,
+                cause="an earlier run was killed or failed, or is still at work",
+                next="give --force to replace it, or move it away",
+            )
+        try:
+            self.part.unlink(missing_ok=True)
+            return h5py.File(self.part, "x", libver=("v108", "v108"))  # checksummed metadata, readable after a kill
+        except OSError as error:
+            raise HostError("the scene cannot be written here", value=f"{self.path}: {error}") from error
+
+    def add(
+        self,
+        view: View,
+        *,
+        light: ArrayLike | None = None,
+        at_ns: int | None = None,
+        trajectory: Trajectory | None = None,
+    ) -> None:
+        """Write a view, and of a simulated one its truth: sharp linear light [H,W,3], its instant, the exact path.
+
+        Raises:
+            UsageError: a name taken or not allowed, a size that is not the camera's, truth in a scene without.
+            NumericsError: light or sensor rows that are not finite.
+        """
+        self._check(view, light is not None or at_ns is not None or trajectory is not None)
+        with disk_faults(self.path):
+            group = self._views.create_group(view.name)
+            self._put_view(group, view)
+            self._put_view_truth(view.name, light, at_ns, trajectory)
+            seal(group)
+            self.names.append(view.name)
+            self._file.flush()
+
+    def _put_view(self, group: h5py.Group, view: View) -> None:
+        put_attr(group, "split", view.split)
+        put_attr(group, "order", len(self.names))
+        frame = view.frame
+        pixels = put(group, "pixels", frame.pixels)
+        for key in ("transfer", "start_ns", "exposure_ns", "row_ns", "clock"):
+            put_attr(pixels, key, getattr(frame, key))
+        if view.spikes is not None:
+            spikes = put(group, "spikes", view.spikes.bits)
+            for key in ("width", "rate_hz", "t0_ns", "clock"):
+                put_attr(spikes, key, getattr(view.spikes, key))
+            put(group, "lost", view.spikes.lost)
+        put(group, "sensor_row", view.sensor_row)
+        put(group, "valid", view.valid)
+        put(group, "pose", view.pose.cam_from_world)
+        if view.trajectory is not None:
+            _put_trajectory(group, view.trajectory)
+
+    def _check(self, view: View, truth: bool) -> None:
+        size = (self.camera.height, self.camera.width)
+        if not NAME.fullmatch(view.name) or view.name in self.names:
+            raise UsageError(
+                "this view's name is taken, or not a name",
+                value=repr(view.name),
+                expected="letters, digits, `-`, `_`, `.`; not starting with a dot; unique in the scene",
+            )
+        if view.frame.pixels.shape[:2] != size:
+            raise UsageError("a frame must have the camera's size", value=view.frame.pixels.shape, expected=str(size))
+        if truth and self.truth is None:
+            raise UsageError(
+                "truth of a view in a scene without truth", value=view.name, next="give SceneWriter truth="
+            )
+        if not np.isfinite(view.sensor_row).all():
+            raise NumericsError("sensor rows must be finite", value=view.name)
+
+    def _put_truth(self, truth: Truth) -> None:
+        group = self._file.create_group("truth")
+        put_attr(group, "seed", truth.seed)
+        put_attr(group, "label", truth.label)
+        put_json(group, "effects", truth.effects)
+        _put_clock(group, truth.clock)
+        self._true_views = group.create_group("views")
+
+    def _put_view_truth(self, name: str, light: ArrayLike | None, at_ns: int | None, path: Trajectory | None) -> None:
+        truth = self.truth
+        if truth is None:
+            return
+        light = truth.light.get(name) if light is None else light
+        at_ns = truth.at_ns.get(name) if at_ns is None else at_ns
+        path = truth.trajectories.get(name) if path is None else path
+        if light is None and at_ns is None and path is None:
+            return
+        group = self._true_views.create_group(name)
+        put_attr(group, "at_ns", at_ns)
+        if light is not None:
+            array = np.asarray(light, np.float32)
+            if array.shape != (self.camera.height, self.camera.width, 3):
+                raise UsageError("true light is [H,W,3] of the camera's size", value=array.shape)
+            if not np.isfinite(array).all():
+                raise NumericsError("true light must be finite", value=name)
+            put(group, "light", array)
+        if path is not None:
+            _put_trajectory(group, path)
+        seal(group)
+
+    def close(self) -> None:
+        """Finish: everything sealed, status "complete", synced to disk, renamed to its name."""
+        if not self._file:
+            return
+        try:
+            with disk_faults(self.path):
+                self._finish(self._file)
+        except BaseException:
+            self.abort()
+            raise
+        if self.path.exists() and not self.force:
+            raise UsageError("the scene appeared while it was being written", value=self.path, next=f"see {self.part}")
+        os.replace(self.part, self.path)
+        _sync(self.path.parent)
+        remember(self.path)
+
+    def _finish(self, root: h5py.File) -> None:
+        put_json(root, "info", self.info)
+        if self.calibration is not None:
+            put_json(root, "calibration", self.calibration)
+        if self.clock is not None:
+            _put_clock(root, self.clock)
+        if self.points is not None:
+            group = root.create_group("points")
+            put_attr(group, "source", self.points.source)
+            put(group, "xyz", self.points.xyz)
+            put(group, "rgb", self.points.rgb)
+        put_attr(root, "light_gain", self.light_gain)
+        put_attr(root, "status", "complete")
+        seal(root)
+        root.close()
+        _sync(self.part)
+
+    def abort(self, keep: bool = True) -> None:
+        """Stop: status "aborted"; the part is kept if it holds a view and `keep`, else removed."""
+        if not self._file:
+            return
+        try:
+            put_attr(self._file, "status", "aborted")
+            self._file.close()
+        finally:
+            if not (keep and self.names):
+                self.part.unlink(missing_ok=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.abort()
+
+
+def write(path: str | Path, scene: Scene, force: bool) -> None:
+    """What `store.write_scene` does."""
+    truth = scene.truth
+    if truth is not None:
+        strangers = {*truth.light, *truth.at_ns, *truth.trajectories} - {view.name for view in scene.views}
+        if strangers:
+            raise UsageError("truth of views that the scene does not have", value=sorted(strangers)[:8])
+    more = {key: getattr(scene, key) for key in ("light_gain", "info", "points", "clock", "calibration")}
+    out = SceneWriter(path, scene.name, scene.camera, **more, truth=truth, force=force)
+    try:
+        for view in scene.views:
+            out.add(view)
+        out.close()
+    except BaseException:
+        out.abort(keep=False)
+        raise
+
+
+def put(parent: h5py.Group, name: str, values: ArrayLike) -> h5py.Dataset:
+    """Store an array of the schema's type, contiguous and unfiltered."""
+    row = row_of(f"{(parent.name or '').rstrip('/')}/{name}")
+    if row is None:
+        raise UsageError("not in the schema", value=f"{parent.name}/{name}")
+    return parent.create_dataset(name, data=np.ascontiguousarray(values, np.dtype("<" + row.dtype)))
+
+
+def put_attr(thing: h5py.Group | h5py.Dataset, name: str, value: str | float | None) -> None:
+    """Store an attribute by its kind in the schema; None leaves it out."""
+    row = row_of(thing.name)
+    kind = "text" if name == DIGEST else row.attrs[name].dtype if row else "text"
+    if value is None:
+        return
+    if kind == "text":
+        raw = str(value).encode()
+        if len(raw) > MAX_TEXT or b"\0" in raw:
+            raise UsageError("a text too long, or with a NUL, for an attribute", value=f"{thing.name}@{name}")
+        stored: Any = np.array(raw, h5py.string_dtype("utf-8", max(len(raw), 1)))
+    else:
+        try:
+            stored = np.int64(value) if kind == "int" else np.float64(value)
+        except OverflowError as error:
+            raise UsageError("a number beyond 64 bits", value=f"{thing.name}@{name} = {value}") from error
+    thing.attrs[name] = stored
+
+
+def put_json(parent: h5py.Group, name: str, record: Mapping[str, Any]) -> None:
+    """Store a JSON object as its bytes."""
+    text = json.dumps(jsonable(dict(record)), allow_nan=False, ensure_ascii=False)
+    put(parent, name, np.frombuffer(text.encode(), np.uint8))
+
+
+def _put_clock(parent: h5py.Group, clock: ClockModel) -> None:
+    group = parent.create_group("clock")
+    put_attr(group, "drift_ppm", clock.drift_ppm)
+    for name in ("device_ns", "rig_ns", "sigma_ns"):
+        put(group, name, getattr(clock, name))
+
+
+def _put_trajectory(parent: h5py.Group, path: Trajectory) -> None:
+    group = parent.create_group("trajectory")
+    put(group, "at_ns", path.at_ns)
+    put(group, "poses", path.poses)
+    if path.cov is not None:
+        put(group, "cov", path.cov)
+
+
+def digest(thing: h5py.Group | h5py.Dataset) -> str:
+    """SHA-256 (hex) of an object: its attributes by name, then a dataset's type, shape and bytes or a group's members.
+
+    Edges:
+        The attribute `sha256` itself is left out; a group's members enter by name and by their stored digests.
+    """
+    total = hashlib.sha256()
+    for name in sorted(set(thing.attrs) - {DIGEST}):
+        value: Any = thing.attrs[name]
+        plain = value.decode() if isinstance(value, bytes) else value.hex() if hasattr(value, "hex") else int(value)
+        total.update(f"@{name}={plain}\0".encode())
+    if isinstance(thing, h5py.Group):
+        for name in sorted(thing):
+            total.update(f"{name}:{stored_digest(member(thing, name))}\0".encode())
+        return total.hexdigest()
+    total.update(f"{thing.dtype.str}{thing.shape}\0".encode())
+    rows = max(1, _BLOCK // max(1, thing.nbytes // max(1, thing.shape[0])))
+    for k in range(0, thing.shape[0] if thing.size else 0, rows):
+        total.update(np.ascontiguousarray(thing[k : k + rows]).data)
+    return total.hexdigest()
+
+
+def seal(thing: h5py.Group | h5py.Dataset) -> None:
+    """Give an object, and everything below it that has none, its digest; members first."""
+    if isinstance(thing, h5py.Group):
+        for name in names(thing):
+            below = member(thing, name)
+            if not stored_digest(below):
+                seal(below)
+    put_attr(thing, DIGEST, digest(thing))
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,73 @@
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/vector.h>
+
+#include <stdexcept>
+#include <vector>
+
+#include "light.hpp"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+using Floats = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
+using Const = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
+
+namespace {
+
+void need(bool holds, const char *what) {
+  if (!holds) throw std::invalid_argument(what);
+}
+
+nb::tuple tfs(Const image, Const texture, Const weight, Const gray, int domain, Floats grad) {
+  auto pixels = static_cast<int64_t>(texture.size());
+  need(image.size() == 3 * texture.size() && weight.size() == texture.size() && grad.size() == image.size(),
+       "tfs: image and grad are [P,3], texture and weight [P]");
+  need(gray.size() == 4 && domain >= 0 && domain <= 2, "tfs: gray is [4], domain 0..2");
+  double value, by_gray[4];
+  {
+    nb::gil_scoped_release release;
+    value = DISPATCH(tfs, image.data(), texture.data(), weight.data(), gray.data(), pixels,
+                     static_cast<spikerig::Domain>(domain), grad.data(), by_gray);
+  }
+  return nb::make_tuple(value, nb::make_tuple(by_gray[0], by_gray[1], by_gray[2], by_gray[3]));
+}
+
+std::vector<const float *> starts(const std::vector<Const> &images, size_t count) {
+  need(!images.empty(), "average: at least one image");
+  std::vector<const float *> at;
+  for (const Const &image : images) {
+    need(image.size() == count, "average: all images have one size");
+    at.push_back(image.data());
+  }
+  return at;
+}
+
+void average(const std::vector<Const> &images, Floats out, Floats light) {
+  need(light.size() == out.size(), "average: out and light have one size");
+  auto at = starts(images, out.size());
+  nb::gil_scoped_release release;
+  DISPATCH(average, at.data(), static_cast<int>(at.size()), static_cast<int64_t>(out.size()), out.data(), light.data());
+}
+
+void average_back(const std::vector<Const> &images, Const out, Const light, Const grad, const std::vector<Floats> &to) {
+  need(light.size() == out.size() && grad.size() == out.size() && to.size() == images.size(),
+       "average_back: out, light and grad have one size, one gradient an image");
+  auto at = starts(images, out.size());
+  std::vector<float *> into;
+  for (const Floats &g : to) {
+    need(g.size() == out.size(), "average_back: gradients have the images' size");
+    into.push_back(g.data());
+  }
+  nb::gil_scoped_release release;
+  DISPATCH(average_back, at.data(), static_cast<int>(at.size()), static_cast<int64_t>(out.size()), out.data(),
+           light.data(), grad.data(), into.data());
+}
+
+}  // namespace
+
+void bind_light(nb::module_ &m) {
+  m.def("tfs", &tfs, "image"_a, "texture"_a, "weight"_a, "gray"_a, "domain"_a, "grad"_a,
+        "The TfS term and its gradients; train.losses.tfs_loss checks and wraps it.");
+  m.def("average", &average, "images"_a, "out"_a, "light"_a, "Mean in linear light of sRGB-coded images, coded.");
+  m.def("average_back", &average_back, "images"_a, "out"_a, "light"_a, "grad"_a, "to"_a, "Gradient of `average`.");
+}

@@ -1,1 +1,0 @@
-namespace spikerig::SPIKERIG_ISA { void nothing() {} }

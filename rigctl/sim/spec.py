@@ -1,0 +1,257 @@
+"""The scene file: what to simulate, as one tree of frozen records read from TOML."""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from spikerig.dataset.errors import UsageError
+from spikerig.rigctl.sim.effects import Effect, read_effects
+from spikerig.rigctl.sim.limits import Faults, limits, nearest, read_record
+from spikerig.rigctl.sim.world import Vec3, World, read_world
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """`[camera]`: size in pixels and horizontal field of view."""
+
+    width: int = limits(200, 1, 8192, "px")
+    height: int = limits(125, 1, 8192, "px")
+    fov_deg: float = limits(60.0, 1, 170, "degrees")
+    samples: int = limits(2, 1, 16, "rays a pixel along each axis")
+
+
+@dataclass(frozen=True, slots=True)
+class Orbit:
+    """`[orbit]`: viewpoints on an arc around the vertical through `target`, all looking at it.
+
+    `views` are spread evenly from `start_deg` over `arc_deg`, ends included. Every `test_every`-th (the third of five)
+    is for testing, unless `test` lists them by number from 0.
+    """
+
+    views: int = limits(30, 1, 100_000)
+    start_deg: float = limits(0.0, -3600, 3600, "degrees")
+    arc_deg: float = limits(174.0, -3600, 3600, "degrees")
+    radius: float = limits(2.0, 1e-3, 1e6, "world units")
+    height: float = limits(1.0, -1e6, 1e6, "world units")
+    target: Vec3 = limits((0.0, 0.0, 0.0), -1e6, 1e6, "world units")
+    test_every: int = limits(5, 0, 100_000, "views; 0 for no test views")
+    test: tuple[float, ...] = limits((), 0, 100_000, "view numbers")
+
+    def held_out(self) -> frozenset[int]:
+        """Numbers of the views for testing."""
+        if self.test:
+            return frozenset(int(k) for k in self.test)
+        return frozenset(range(self.test_every // 2, self.views, self.test_every) if self.test_every else ())
+
+
+@dataclass(frozen=True, slots=True)
+class Shake:
+    """`[shake]`: hand shake over one exposure, a cubic spline of rotation and translation.
+
+    Args:
+        path_px: the image centre's path over the exposure, drawn evenly from this range for each view.
+        curvature: 0 moves straight and evenly; 1 is as much bend as motion.
+        translation: share of the path that comes from moving rather than turning the camera.
+        roll: turning about the optical axis beside turning across it.
+    """
+
+    path_px: tuple[float, float] = limits((6.0, 11.0), 0, 1e4, "px")
+    curvature: float = limits(0.35, 0, 10)
+    translation: float = limits(0.2, 0, 1)
+    roll: float = limits(0.3, 0, 10)
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """`[exposure]`: timing of one view.
+
+    Args:
+        protocol: `rig` (40 kHz over a real exposure) or `paper` (18 one-bit samples an exposure, threshold 2); a
+            protocol only sets defaults.
+        exposure_ms, rate_hz: their product is the ticks of an exposure, a whole number.
+        sub_poses: pictures cast over an exposure, ends included (`linear`) or one a slot (`hold`).
+        margin_ticks: spikes kept on each side of the exposure.
+        light: between sub-poses the light is `linear` in time, or each `hold`s for its slot.
+        label: the instant a view is labelled with and its sharp truth is cast: `mid` exposure, or its `first` sub-pose.
+        phase: charge of a pixel before its first tick: `random` or `zero`.
+        period_ms: from one view's exposure to the next.
+    """
+
+    protocol: str = limits("rig", choices=("rig", "paper"))
+    exposure_ms: float = limits(8.0, 1e-3, 1e5, "ms")
+    rate_hz: float = limits(40_000.0, 1, 1e8, "Hz")
+    sub_poses: int = limits(17, 1, 100_000)
+    margin_ticks: int = limits(256, 0, 1_000_000, "ticks")
+    light: str = limits("linear", choices=("linear", "hold"))
+    label: str = limits("mid", choices=("mid", "first"))
+    phase: str = limits("random", choices=("random", "zero"))
+    period_ms: float = limits(1000.0, 1e-2, 1e7, "ms")
+
+    @property
+    def ticks(self) -> int:
+        """Ticks of an exposure."""
+        return round(self.exposure_ms * 1e-3 * self.rate_hz)
+
+    @property
+    def tick_ns(self) -> float:
+        """Nanoseconds a tick."""
+        return 1e9 / self.rate_hz
+
+
+PAPER: Mapping[str, Any] = {"exposure_ms": 0.45, "sub_poses": 18, "margin_ticks": 0, "light": "hold"}
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """`[sensor]`: light to charge.
+
+    Args:
+        gain: spikes a tick at RGB white (1 / threshold in the paper's units); 0.4, or 0.5 for `paper`.
+        response: of the spike camera to linear red, green and blue.
+    """
+
+    gain: float = limits(0.4, 1e-9, 1e9, "spikes a tick at white")
+    response: Vec3 = limits((0.299, 0.587, 0.114), 0, 100)
+
+
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """`[points]`: noisy surface points; `depth_noise` is relative, colours come from the blurry pictures."""
+
+    count: int = limits(7200, 0, 100_000_000)
+    depth_noise: float = limits(0.01, 0, 1)
+
+
+@dataclass(frozen=True, slots=True)
+class SceneSpec:
+    """A whole scene file."""
+
+    name: str
+    seed: int
+    lens: Lens
+    orbit: Orbit
+    shake: Shake
+    exposure: Exposure
+    sensor: Sensor
+    cloud: Cloud
+    world: World
+    effects: tuple[Effect, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Top:
+    name: str = limits("")
+    seed: int = limits(0, 0, 2**32 - 1)
+    effects: Any = limits(())
+    camera: Any = limits({})
+    orbit: Any = limits({})
+    shake: Any = limits({})
+    exposure: Any = limits({})
+    sensor: Any = limits({})
+    points: Any = limits({})
+    world: Any = limits({})
+
+
+def builtin_names() -> list[str]:
+    """Names of the scenes that come with the package."""
+    return sorted(
+        p.name[:-5] for p in files("spikerig.rigctl.sim").joinpath("scenes").iterdir() if p.name[-5:] == ".toml"
+    )
+
+
+def load_scene_toml(path_or_name: str | Path) -> SceneSpec:
+    """The scene of a TOML file, or of a built-in name such as `demo`.
+
+    Raises:
+        UsageError: no such file or name, not TOML, unknown keys, wrong types, values out of range: all told at once.
+    """
+    text_name = str(path_or_name)
+    if text_name in builtin_names():
+        text = files("spikerig.rigctl.sim").joinpath(f"scenes/{text_name}.toml").read_text(encoding="utf-8")
+    else:
+        try:
+            text = Path(path_or_name).read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise UsageError(
+                "cannot read the scene file",
+                value=f"{text_name} ({getattr(error, 'strerror', None) or 'not UTF-8 text'})",
+                expected=f"a TOML file, or a built-in scene: {', '.join(builtin_names())}",
+                cause="" if text_name.endswith(".toml") else nearest(text_name, builtin_names()),
+            ) from None
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise UsageError("the scene file is not valid TOML", value=f"{text_name}: {error}") from None
+    return read_scene(table, text_name)
+
+
+def read_scene(table: Mapping[str, Any], source: str = "the scene") -> SceneSpec:
+    """A scene from a parsed TOML table; see `load_scene_toml`."""
+    faults = Faults(source)
+    top = read_record(_Top, table, "", faults)
+    raw_exposure = top.exposure if isinstance(top.exposure, Mapping) else {}
+    paper = raw_exposure.get("protocol") == "paper"
+    exposure = read_record(Exposure, top.exposure, "exposure", faults, PAPER if paper else None)
+    spec = SceneSpec(
+        name=top.name or Path(source).stem,
+        seed=top.seed,
+        lens=read_record(Lens, top.camera, "camera", faults),
+        orbit=read_record(Orbit, top.orbit, "orbit", faults),
+        shake=read_record(Shake, top.shake, "shake", faults),
+        exposure=exposure,
+        sensor=read_record(Sensor, top.sensor, "sensor", faults, {"gain": 0.5} if paper else None),
+        cloud=read_record(Cloud, top.points, "points", faults),
+        world=read_world(top.world, faults),
+        effects=read_effects(top.effects, exposure.phase, faults),
+    )
+    _cross_check(spec, faults)
+    faults.raise_any()
+    return spec
+
+
+def _cross_check(spec: SceneSpec, faults: Faults) -> None:
+    """Faults that need more than one key to see."""
+    exposure, orbit = spec.exposure, spec.orbit
+    ticks = exposure.exposure_ms * 1e-3 * exposure.rate_hz
+    if ticks < 0.5 or abs(ticks - round(ticks)) > 1e-6 * ticks:
+        faults.add("exposure.exposure_ms", f"x rate_hz is {ticks:g} ticks, expected a whole number, at least 1")
+    elif exposure.sub_poses > exposure.ticks + (exposure.light == "linear"):
+        faults.add(
+            "exposure.sub_poses", f"is {exposure.sub_poses}, more than the {exposure.ticks} ticks of an exposure"
+        )
+    span_ms = exposure.exposure_ms + 2e3 * exposure.margin_ticks / exposure.rate_hz
+    if exposure.period_ms < span_ms:
+        faults.add("exposure.period_ms", f"is {exposure.period_ms:g}, less than exposure and margins, {span_ms:g} ms")
+    if spec.shake.path_px[0] > spec.shake.path_px[1]:
+        faults.add("shake.path_px", f"is {list(spec.shake.path_px)}, expected [low, high]")
+    for k in orbit.test:
+        if k != int(k) or k >= orbit.views:
+            faults.add("orbit.test", f"holds {k:g}, expected view numbers 0 to {orbit.views - 1}")
+    if sum(spec.sensor.response) <= 0:
+        faults.add("sensor.response", "is all zero: the spike camera would be blind")
+    if len(orbit.held_out()) >= orbit.views:
+        faults.add("orbit.test_every", "leaves no view to train on")
+    if orbit.radius == 0 or not spec.world.solids:
+        faults.add("world.solids", "is empty: nothing to look at")
+
+
+def with_changes(spec: SceneSpec, *, seed: int | None = None, views: int | None = None) -> SceneSpec:
+    """The scene with another seed (shake, noise, points; not the world) or number of viewpoints on the same arc."""
+    if seed is not None:
+        if not 0 <= seed < 2**32:
+            raise UsageError("a seed is a whole number", value=seed, expected="0 to 4294967295")
+        spec = dataclasses.replace(spec, seed=seed)
+    if views is not None:
+        if not 1 <= views <= 100_000:
+            raise UsageError("too few or too many views", value=views, expected="1 to 100000")
+        spec = dataclasses.replace(spec, orbit=dataclasses.replace(spec.orbit, views=views))
+        faults = Faults("--views")
+        _cross_check(spec, faults)
+        faults.raise_any()
+    return spec

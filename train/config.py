@@ -1,0 +1,295 @@
+"""One flat, frozen config of a fit; presets and methods are functions that return or adjust one.
+
+Every ambiguity of the paper is a named switch here, with its default. "w" always ends as a mean-equivalent weight:
+all loss terms are means over pixels, textures in [0,1] where 1 is display white.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+from spikerig.dataset.errors import UsageError
+
+CHOICES: dict[str, tuple[str, ...]] = {
+    "field": ("splat",),
+    "init": ("points", "random"),
+    "background": ("black", "white", "random"),
+    "densify": ("off", "mcmc"),
+    "colour_loss": ("l1ssim", "l2"),
+    "colour_target": ("frame", "truth"),
+    "pose_label": ("mid", "first"),
+    "instants_rule": ("midpoints", "endpoints"),
+    "textures": ("both", "tfp", "tfi", "raw"),
+    "tfs_combine": ("average", "sum"),
+    "tfs_domain": ("encoded", "linear", "luma", "naive"),
+    "highlights": ("clip", "keep"),
+    "gray": ("calibrated", "rec601", "learned"),
+    "weight_reading": ("mean", "sum-batch", "sum-image", "u8"),
+    "device": ("cpu", "cuda"),
+}
+PAPER_BATCH = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class FitConfig:
+    """All knobs of a fit; units in the names or beside them.
+
+    Model: `splats` is the number to start with (points are thinned or duplicated to it) and the cap of densification;
+    learning rates are per step at the start of the run and fall exponentially to `lr_end` times that, by the fraction
+    of steps done, or of seconds spent where `seconds` > 0. `lr_means` is in units of the normalised scene ([-1, 1]).
+
+    Camera: a blurry frame is explained by `poses_per_view` sub-poses of its exposure, averaged in linear light. One
+    sub-pose is the instant of `pose_label` (the paper does not say which). More lie at (j+1/2)/n of the exposure
+    (`instants_rule` midpoints) or at j/(n-1) (endpoints).
+
+    TfS: `tfs_weight` in the reading `weight_reading` of Eq. TfS (`effective_weight` maps it); textures at
+    `textures_per_view` instants, of kind `textures` (`both` = TFP and TFI, averaged to one residual by `tfs_combine`
+    average, or two losses by sum; `raw` = the spike bit itself). `tfs_domain`: encoded = sRGB of texture against sRGB
+    of the gray of the linearised render; linear = both linear; luma = gray of the encoded render against the encoded
+    texture; naive = gray of the encoded render against the linear texture (wrong, for the ablation). `highlights`:
+    clip textures to display white, where RGB ends too, or keep them.
+
+    Ratio: until `ratio_until` of the run the colour target is the frame times the ratio of the texture at one of
+    `ratio_instants` instants (a random one a step) to the exposure's mean.
+    """
+
+    field: str = "splat"
+    method: str = "plain"
+    preset: str = "standard"
+    seed: int = 0
+    device: str = "cpu"
+    steps: int = 3000
+    seconds: float = 0.0
+    # model
+    splats: int = 12_000
+    sh_degree: int = 0
+    sh_warmup: float = 0.25
+    init: str = "points"
+    init_opacity: float = 0.5
+    init_scale: float = 0.8
+    antialias: bool = False
+    background: str = "black"
+    densify: str = "off"
+    densify_every: int = 100
+    densify_until: float = 0.7
+    noise: float = 5e4
+    opacity_reg: float = 0.0
+    scale_reg: float = 0.0
+    # rates
+    lr_means: float = 4e-4
+    lr_scales: float = 1e-2
+    lr_quats: float = 2e-3
+    lr_opacities: float = 5e-2
+    lr_colours: float = 5e-3
+    lr_gray: float = 1e-3
+    lr_end: float = 0.3
+    # colour term and camera
+    colour_target: str = "frame"
+    colour_loss: str = "l1ssim"
+    ssim_weight: float = 0.2
+    poses_per_view: int = 1
+    pose_label: str = "mid"
+    instants_rule: str = "midpoints"
+    # TfS
+    tfs_weight: float = 0.0
+    weight_reading: str = "mean"
+    textures_per_view: int = 1
+    textures: str = "both"
+    tfs_combine: str = "average"
+    tfs_domain: str = "encoded"
+    tfp_window: int = 32
+    highlights: str = "clip"
+    gray: str = "calibrated"
+    # ratio
+    ratio_until: float = 0.0
+    ratio_instants: int = 5
+    ratio_eps: float = 0.01
+    ratio_min: float = 0.15
+    ratio_max: float = 6.0
+
+    def __post_init__(self) -> None:
+        faults = [
+            f"{name} is '{getattr(self, name)}', not one of {', '.join(choices)}"
+            for name, choices in CHOICES.items()
+            if getattr(self, name) not in choices
+        ]
+        faults += [text for wrong, text in self._range_faults() if wrong]
+        if faults:
+            raise UsageError("the settings of this fit do not hold together", value="; ".join(faults))
+
+    def _range_faults(self) -> list[tuple[bool, str]]:
+        positive = ("steps", "splats", "densify_every", "poses_per_view", "textures_per_view", "tfp_window")
+        rates = [f.name for f in fields(self) if f.name.startswith("lr_")]
+        return [
+            *((getattr(self, name) < 1, f"{name} must be at least 1") for name in (*positive, "ratio_instants")),
+            *((not 0 <= getattr(self, name) < 1e6, f"{name} must be 0 or more") for name in rates),
+            *((not 0 <= getattr(self, n) < 1e12, f"{n} must be 0 or more") for n in ("noise", "tfs_weight", "seconds")),
+            (not 0 <= self.sh_degree <= 3, "sh_degree must be 0 to 3"),
+            (not 0 < self.init_opacity < 1, "init_opacity must lie between 0 and 1"),
+            (not 0 < self.init_scale < 1e3, "init_scale must be positive"),
+            (not 0 <= self.ssim_weight <= 1, "ssim_weight must be 0 to 1"),
+            (not 0 < self.lr_end <= 1, "lr_end must be in (0, 1]"),
+            *(
+                (not 0 <= getattr(self, n) <= 1, f"{n} is a fraction, 0 to 1")
+                for n in ("ratio_until", "sh_warmup", "densify_until")
+            ),
+            (self.ratio_eps <= 0, "ratio_eps must be positive"),
+            (not 0 < self.ratio_min <= 1 <= self.ratio_max, "ratio_min <= 1 <= ratio_max must hold"),
+            (self.pose_label == "first" and self.colour_target == "truth", "the truth is not labelled by pose_label"),
+        ]
+
+    @property
+    def needs_spikes(self) -> bool:
+        """Whether any term reads spikes."""
+        return self.tfs_weight > 0 or self.ratio_until > 0
+
+    @property
+    def needs_trajectory(self) -> bool:
+        """Whether any instant but mid-exposure is rendered."""
+        many = self.poses_per_view > 1 and self.ratio_until < 1
+        textures = self.tfs_weight > 0 and self.textures_per_view > 1
+        ratio = self.ratio_until > 0 and self.ratio_instants > 1
+        return many or textures or ratio or self.pose_label == "first"
+
+    def as_json(self) -> dict[str, Any]:
+        """A JSON-ready record of every setting."""
+        return asdict(self)
+
+
+def from_json(record: dict[str, Any]) -> FitConfig:
+    """The config of a stored record; unknown names are an error (a newer spikerig wrote it)."""
+    known = {f.name for f in fields(FitConfig)}
+    if strange := sorted(set(record) - known):
+        raise UsageError(
+            "settings this version does not know",
+            value=", ".join(strange),
+            expected="settings of this version",
+            cause="the run was written by a newer spikerig",
+            next="pip install --upgrade spikerig",
+        )
+    return FitConfig(**record)
+
+
+def draft() -> FitConfig:
+    """Minutes on two cores: 12k splats, one colour each, no densification."""
+    return FitConfig(preset="draft")
+
+
+def standard() -> FitConfig:
+    """A quarter of an hour at 400x250: 30k splats grown by MCMC, view-dependent colour of degree 1."""
+    return FitConfig(
+        preset="standard",
+        steps=10_000,
+        splats=30_000,
+        sh_degree=1,
+        densify="mcmc",
+        lr_end=0.1,
+        opacity_reg=0.01,
+        scale_reg=0.01,
+    )
+
+
+def full() -> FitConfig:
+    """Hours on a CPU: 100k splats, degree 3, antialiased, 30,000 steps."""
+    return replace(standard(), preset="full", steps=30_000, splats=100_000, sh_degree=3, antialias=True, lr_end=0.03)
+
+
+PRESETS: dict[str, Callable[[], FitConfig]] = {"draft": draft, "standard": standard, "full": full}
+
+
+def plain(config: FitConfig) -> FitConfig:
+    """Blurry RGB, one pose a view: what anyone gets without spikes."""
+    return replace(config, method="plain")
+
+
+def average(config: FitConfig) -> FitConfig:
+    """Blurry RGB explained by 5 known sub-poses averaged in linear light: the honest baseline without spikes."""
+    return replace(config, method="average", poses_per_view=5)
+
+
+def spikenerf(config: FitConfig) -> FitConfig:
+    """The paper's TfS loss, 1x: one pose, one texture; L2 colour, as an L1 would keep pulling to the blur."""
+    return replace(config, method="spikenerf", colour_loss="l2", tfs_weight=20.0)
+
+
+def spikenerf_5x(config: FitConfig) -> FitConfig:
+    """The paper's 5x: 5 sub-poses averaged for colour, a texture at each."""
+    return replace(config, method="spikenerf-5x", poses_per_view=5, textures_per_view=5, tfs_weight=5.0)
+
+
+def spike_ratio(config: FitConfig) -> FitConfig:
+    """Ours: the frame times the ratio of texture to exposure mean, at a random instant of 5 a step."""
+    return replace(config, method="spike-ratio", ratio_until=1.0)
+
+
+def spike_hybrid(config: FitConfig) -> FitConfig:
+    """Ours, for strong chroma: spike-ratio for 35 % of the run, then the 5-pose average; TfS throughout."""
+    return replace(
+        config, method="spike-hybrid", ratio_until=0.35, poses_per_view=5, textures_per_view=5, tfs_weight=5.0
+    )
+
+
+def oracle(config: FitConfig) -> FitConfig:
+    """The ceiling: sharp truth at the training poses (simulated scenes only)."""
+    return replace(config, method="oracle", colour_target="truth")
+
+
+METHODS: dict[str, Callable[[FitConfig], FitConfig]] = {
+    "plain": plain,
+    "average": average,
+    "spikenerf": spikenerf,
+    "spikenerf-5x": spikenerf_5x,
+    "spike-ratio": spike_ratio,
+    "spike-hybrid": spike_hybrid,
+    "oracle": oracle,
+}
+
+
+def configure(method: str = "plain", preset: str = "standard", **changes: Any) -> FitConfig:
+    """The config of a method at a preset, with changes by name.
+
+    Raises:
+        UsageError: an unknown method, preset, setting or value.
+    """
+    for name, value, table in (("method", method, METHODS), ("preset", preset, PRESETS)):
+        if value not in table:
+            raise UsageError(f"no such {name}", value=value, expected=", ".join(table))
+    config = METHODS[method](PRESETS[preset]())
+    known = {f.name for f in fields(config)}
+    if strange := sorted(set(changes) - known):
+        raise UsageError("no such setting", value=", ".join(strange), expected=", ".join(sorted(known)))
+    return replace(config, **changes)
+
+
+def parse_setting(text: str) -> tuple[str, Any]:
+    """`name=value` from a command line as (name, typed value)."""
+    name, equals, value = text.partition("=")
+    types = {f.name: str(f.type) for f in fields(FitConfig)}
+    if not equals or name not in types:
+        raise UsageError("a setting is name=value", value=text, expected="one of: " + ", ".join(sorted(types)))
+    try:
+        if types[name] == "bool":
+            return name, {"true": True, "false": False}[value.lower()]
+        return name, {"int": int, "float": float, "str": str}[types[name]](value)
+    except (ValueError, KeyError):
+        raise UsageError(f"'{name}' takes a value of type {types[name]}", value=value) from None
+
+
+def effective_weight(weight: float, reading: str, pixels: int) -> float:
+    """The mean-equivalent weight of the paper's w under a reading of Eq. TfS.
+
+    Args:
+        weight: w as given.
+        reading: mean = both terms are means over pixels, textures in [0,1]; sum-batch = TfS is a sum over a batch of
+            1024 rays, colour a mean; sum-image = TfS is a sum over a whole image; u8 = textures in 0..255, colour in
+            [0,1].
+        pixels: of one image.
+
+    Source: paper, Eq. TfS; facts on which reading makes 1e-4 do anything (only u8, 6.5, and sum-image).
+    """
+    scale = {"mean": 1.0, "sum-batch": float(PAPER_BATCH), "sum-image": float(pixels), "u8": 255.0**2}
+    if reading not in scale:
+        raise UsageError("no such reading of w", value=reading, expected=", ".join(scale))
+    return weight * scale[reading]

@@ -1,0 +1,282 @@
+"""The loop: views -> loss -> splats. Same seed and steps give the same bits for any thread count, resumed or not.
+
+How that is kept: the kernels' sums have a fixed order; torch is held to one thread (its own reductions and chunked
+elementwise ops are not independent of the count); every draw comes from (seed, step), so there is no generator whose
+state could be lost; the checkpoint holds parameters, Adam's moments, step, and history.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from spikerig.dataset.errors import NumericsError
+from spikerig.dataset.scene import Camera
+from spikerig.train import checkpoint
+from spikerig.train.config import FitConfig, effective_weight
+from spikerig.train.densify import jolt, relocate
+from spikerig.train.gauge import Gauge
+from spikerig.train.losses import average_exposure, l2_loss, mean_weights, tfs_loss
+from spikerig.train.model import BACKGROUNDS, Model, splats_of
+from spikerig.train.ssim import l1_ssim
+from spikerig.train.targets import Targets, TrainView
+
+RATES = {
+    "means": "lr_means",
+    "quats": "lr_quats",
+    "log_scales": "lr_scales",
+    "logit_opacities": "lr_opacities",
+    "sh": "lr_colours",
+    "gray": "lr_gray",
+}
+HIGHER_SH = 1 / 20  # learning rate of the view-dependent coefficients, of the constant one's
+CHECK_EVERY = 50  # steps between looks for values that are not finite
+
+
+@dataclass(slots=True, eq=False)
+class State:
+    """What a fit changes: parameters by name, Adam, the next step, seconds trained, held-out dB over time."""
+
+    params: dict[str, Tensor]
+    optimiser: torch.optim.Adam
+    step: int = 0
+    seconds: float = 0.0
+    history: list[dict[str, Any]] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Task:
+    """What a fit works with and does not change; `gray` [4]: the frozen converter, or where the learned one starts."""
+
+    config: FitConfig
+    camera: Camera
+    gauge: Gauge
+    targets: Targets
+    gray: Tensor
+
+    @property
+    def weight(self) -> float:
+        """Mean-equivalent weight of the TfS term."""
+        pixels = self.camera.width * self.camera.height
+        return effective_weight(self.config.tfs_weight, self.config.weight_reading, pixels)
+
+    def model(self, params: dict[str, Tensor]) -> Model:
+        """The model of the current parameters."""
+        return Model(splats_of(params), self.gauge, self.camera, self.config)
+
+
+def new_state(params: dict[str, Tensor], task: Task) -> State:
+    """Step 0: the given splats, and the gray converter where it is learned."""
+    if task.config.gray == "learned" and task.targets.gray is not None:
+        params = {**params, "gray": task.gray}
+    leaves = {name: p.detach().clone().requires_grad_() for name, p in params.items()}
+    return State(leaves, _adam(leaves))
+
+
+def _adam(leaves: dict[str, Tensor]) -> torch.optim.Adam:
+    return torch.optim.Adam([{"params": [p], "name": n, "lr": 0.0} for n, p in leaves.items()], eps=1e-15, fused=True)
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Hold torch to one thread inside: its elementwise ops and sums depend on the count in the last bits."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def train(
+    state: State,
+    task: Task,
+    *,
+    after: Callable[[State, float, float], None] = lambda state, fraction, loss: None,
+) -> State:
+    """Run a fit to its end.
+
+    Args:
+        state: where to begin; changed in place.
+        task: of the fit; the length of the run is config.steps, or config.seconds of training where positive.
+        after: called after every step with (state, fraction of the run done, loss); its time does not count.
+
+    Returns:
+        The same state.
+
+    Raises:
+        NumericsError: a loss or parameter stopped being finite; names step, tensor and index.
+    """
+    with one_torch_thread():
+        while (fraction := fraction_done(state, task.config)) < 1:
+            begin = time.perf_counter()
+            loss = one_step(state, task, fraction)
+            state.seconds += time.perf_counter() - begin
+            after(state, fraction_done(state, task.config), loss)
+    return state
+
+
+def fraction_done(state: State, config: FitConfig) -> float:
+    """How much of the run is done, by seconds where the config gives them, by steps else."""
+    return state.seconds / config.seconds if config.seconds > 0 else state.step / config.steps
+
+
+def one_step(state: State, task: Task, fraction: float) -> float:
+    """One view, one update; returns the loss. Random draws: view order by epoch, the rest by step."""
+    config = task.config
+    rng = np.random.default_rng((config.seed, 2, state.step))
+    count = len(task.targets.views)
+    order = np.random.default_rng((config.seed, 3, state.step // count)).permutation(count)
+    view = task.targets.views[order[state.step % count]]
+    _set_rates(state, config, fraction)
+    state.optimiser.zero_grad(set_to_none=True)
+    loss = view_loss(state, task, view, fraction, rng)
+    value = loss.item()
+    if not np.isfinite(value):
+        raise _not_finite(state, f"the loss of view '{view.name}' is {value}")
+    loss.backward()
+    state.optimiser.step()
+    if state.step % CHECK_EVERY == 0:
+        check_finite(state)
+    if config.densify == "mcmc":
+        _mcmc(state, config, fraction, rng)
+    state.step += 1
+    return value
+
+
+def view_loss(state: State, task: Task, view: TrainView, fraction: float, rng: np.random.Generator) -> Tensor:
+    """The whole loss of one view: colour term, TfS term, regularisers."""
+    config, targets = task.config, task.targets
+    background = BACKGROUNDS[config.background]
+    if config.background == "random":
+        r, g, b = rng.uniform(0, 1, 3)
+        background = (r, g, b)
+    degree = min(config.sh_degree, int(fraction / max(config.sh_warmup, 1e-9) * (config.sh_degree + 1)))
+    model = task.model(state.params)
+
+    def draw(phase: float) -> Tensor:
+        return model.draw(view.instants[phase].pose, background, degree).image
+
+    if fraction < config.ratio_until:
+        phase = targets.ratio[rng.integers(len(targets.ratio))]
+        pictures = {phase: draw(phase)}
+        loss = colour_loss(pictures[phase], view.instants[phase].ratio.float(), view.valid, config)
+        supervised: tuple[float, ...] = (phase,)
+    else:
+        supervised = targets.tfs
+        pictures = {phase: draw(phase) for phase in dict.fromkeys((*targets.colour, *supervised))}
+        exposed = average_exposure([pictures[phase] for phase in targets.colour])
+        loss = colour_loss(exposed, view.frame, view.valid, config)
+    if task.weight > 0:
+        loss = loss + task.weight * _tfs_term(state, task, view, {p: pictures[p] for p in supervised})
+    if config.opacity_reg > 0:
+        loss = loss + config.opacity_reg * torch.sigmoid(state.params["logit_opacities"]).mean()
+    if config.scale_reg > 0:
+        loss = loss + config.scale_reg * torch.exp(state.params["log_scales"]).mean()
+    return loss
+
+
+def _tfs_term(state: State, task: Task, view: TrainView, pictures: dict[float, Tensor]) -> Tensor:
+    gray = state.params.get("gray", task.gray)
+    terms = [
+        tfs_loss(picture, texture, weight, gray, task.config.tfs_domain)
+        for phase, picture in pictures.items()
+        for texture, weight in view.instants[phase].textures
+    ]
+    return torch.stack(terms).sum() / len(pictures)
+
+
+def colour_loss(image: Tensor, target: Tensor, valid: Tensor | None, config: FitConfig) -> Tensor:
+    """L2, or L1 with structural dissimilarity, as a mean over valid pixels."""
+    if config.colour_loss == "l2":
+        return l2_loss(image, target, None if valid is None else mean_weights(valid))
+    return l1_ssim(image, target, ssim_weight=config.ssim_weight, valid=valid)
+
+
+def _set_rates(state: State, config: FitConfig, fraction: float) -> None:
+    decay = config.lr_end ** min(fraction, 1.0)
+    for group in state.optimiser.param_groups:
+        group["lr"] = getattr(config, RATES[group["name"]]) * decay
+
+
+def _mcmc(state: State, config: FitConfig, fraction: float, rng: np.random.Generator) -> None:
+    splats = {n: p for n, p in state.params.items() if n != "gray"}
+    if state.step > 0 and state.step % config.densify_every == 0 and fraction < config.densify_until:
+        moments = {n: (_moment(state, p, "exp_avg"), _moment(state, p, "exp_avg_sq")) for n, p in splats.items()}
+        with torch.no_grad():
+            moved, moved_moments = relocate(splats, moments, config.splats, rng)
+        _replace(state, moved, moved_moments)
+        splats = {n: p for n, p in state.params.items() if n != "gray"}
+    jolt(splats, config.noise * config.lr_means * config.lr_end**fraction, rng)
+
+
+def _moment(state: State, p: Tensor, name: str) -> Tensor:
+    return state.optimiser.state[p][name]
+
+
+def _replace(state: State, params: dict[str, Tensor], moments: dict[str, tuple[Tensor, Tensor]]) -> None:
+    """Swap tensors (of another length, perhaps) into the optimiser, keeping its step counts."""
+    for group in state.optimiser.param_groups:
+        name = group["name"]
+        if name not in params:
+            continue
+        old = group["params"][0]
+        new = params[name].detach().clone().requires_grad_()
+        kept = state.optimiser.state.pop(old)
+        state.optimiser.state[new] = {**kept, "exp_avg": moments[name][0], "exp_avg_sq": moments[name][1]}
+        group["params"] = [new]
+        state.params[name] = new
+
+
+def check_finite(state: State) -> None:
+    """Raise a NumericsError naming step, tensor and index of the first value that is not finite."""
+    for name, p in state.params.items():
+        if not torch.isfinite(p).all():
+            raise _not_finite(state, f"'{name}' holds values that are not finite")
+
+
+def _not_finite(state: State, what: str) -> NumericsError:
+    where = "no parameter; look at the targets"
+    for name, p in state.params.items():
+        for kind, values in ((name, p), (f"gradient of {name}", p.grad)):
+            bad = None if values is None else torch.nonzero(~torch.isfinite(values))
+            if bad is not None and len(bad):
+                where = f"{kind}, index {bad[0].tolist()} ({len(bad)} in all)"
+                break
+    return NumericsError(
+        f"training diverged at step {state.step}: {what}",
+        value=where,
+        expected="finite numbers",
+        cause="too large a learning rate or weight, or a target that is not finite",
+        next="lower the learning rates (--set lr_means=...) or the TfS weight; resume from the last checkpoint",
+    )
+
+
+def save_state(path: Path, state: State, config: FitConfig) -> None:
+    """Checkpoint: everything that the rest of the run depends on."""
+    tensors: dict[str, Tensor] = {f"param/{n}": p for n, p in state.params.items()}
+    for name, p in state.params.items():
+        for key, value in state.optimiser.state.get(p, {}).items():
+            tensors[f"adam/{name}/{key}"] = value
+    record = {"step": state.step, "seconds": state.seconds, "history": state.history, "config": config.as_json()}
+    checkpoint.save(path, tensors, record)
+
+
+def load_state(path: Path) -> tuple[State, dict[str, Any]]:
+    """The state of a checkpoint, and the config it was made with."""
+    tensors, record = checkpoint.load(path)
+    leaves = {n.removeprefix("param/"): p.requires_grad_() for n, p in tensors.items() if n.startswith("param/")}
+    state = State(leaves, _adam(leaves), int(record["step"]), float(record["seconds"]), list(record["history"]))
+    for name, p in leaves.items():
+        found = {k.split("/")[2]: v for k, v in tensors.items() if k.startswith(f"adam/{name}/")}
+        if found:
+            state.optimiser.state[p] = found
+    return state, record["config"]

@@ -1,0 +1,231 @@
+"""A fit from scene file to run folder: prepare, train with checkpoints and held-out curves, record."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from spikerig.dataset.errors import DataError, UsageError
+from spikerig.dataset.terminal import Progress, note
+from spikerig.train import record as records
+from spikerig.train.config import FitConfig
+from spikerig.train.fit import State, Task, check_finite, load_state, new_state, one_torch_thread, save_state, train
+from spikerig.train.gauge import gauge_of
+from spikerig.train.model import check_pinhole, renderer
+from spikerig.train.ply import export_ply
+from spikerig.train.score import Exam, mean_psnr, novel_views
+from spikerig.train.start import start_splats
+from spikerig.train.targets import load_targets
+
+if TYPE_CHECKING:
+    from spikerig.dataset.store import SceneFile
+
+MOST_EXAMS = 8  # held-out views looked at for the curve
+
+
+def run_fit(
+    path: Path,
+    config: FitConfig,
+    out: Path,
+    *,
+    resume: bool = False,
+    force: bool = False,
+    eval_every: float | None = None,
+    checkpoint_every: float = 60.0,
+    ply: bool = False,
+) -> dict[str, Any]:
+    """Train on a scene file and leave a run folder.
+
+    Args:
+        path: scene file.
+        config: of the fit.
+        out: folder of the run.
+        resume: go on from its checkpoint, where there is one; the config must be the same.
+        force: replace an earlier run.
+        eval_every: seconds of training between held-out scores; None = a tenth of the run, 0 = only at the end.
+        checkpoint_every: seconds between checkpoints.
+        ply: write splats.ply at the end.
+
+    Returns:
+        What `train fit --json` prints.
+    """
+    from spikerig.dataset.store import open_scene
+
+    renderer(config.device)  # a missing extra is told before minutes of preparation
+    begin = time.monotonic()
+    with open_scene(path) as scene, one_torch_thread():
+        records.prepare_folder(out, force=force, resume=resume)
+        task, record = _prepare(scene, path, config)
+        state = _start(out, scene, task, resume)
+        exams = _exams(scene)
+    record["prepare_seconds"] = time.monotonic() - begin
+    _tell(task, record)
+    records.write_json(out / records.RECORD, {**record, "steps": state.step, "train_seconds": state.seconds})
+    watch = _Watch(out, task, exams, eval_every, checkpoint_every)
+    if state.step == 0:
+        watch.look(state, 0.0)
+    try:
+        train(state, task, after=watch)
+    except KeyboardInterrupt:
+        watch.save(state)
+        note(f"stopped at step {state.step}; --resume goes on")
+        raise
+    return _finish(state, watch, record, ply)
+
+
+def _prepare(scene: SceneFile, path: Path, config: FitConfig) -> tuple[Task, dict[str, Any]]:
+    check_pinhole(scene.camera)
+    poses = np.stack([scene.view(name, spikes=False).pose.cam_from_world for name in scene.names] or [np.eye(4)[:3]])
+    points = scene.points
+    gauge = gauge_of(points.xyz if points is not None and config.init == "points" else np.zeros((0, 3)), poses)
+    targets = load_targets(scene, config, gauge)
+    found = targets.gray
+    gray = torch.zeros(4) if found is None else torch.tensor([*found.weights, found.bias])
+    task = Task(config, scene.camera, gauge, targets, gray)
+    about = {"path": str(path), "name": scene.name, "sha256": records.scene_hash(path)}
+    record = records.new_record(config, about, scene.camera, gauge)
+    record |= {
+        "gray": None if found is None else found.as_json(),
+        "effective_tfs_weight": task.weight,
+        "remarks": list(targets.remarks),
+        "renders_per_step": {"ratio": 1 if targets.ratio else 0, "average": len({*targets.colour, *targets.tfs})},
+    }
+    return task, record
+
+
+def _start(out: Path, scene: SceneFile, task: Task, resume: bool) -> State:
+    path = out / records.CHECKPOINT
+    if not (resume and path.exists()):
+        return new_state(start_splats(scene.points, task.gauge, task.config), task)
+    state, config = load_state(path)
+    now = task.config.as_json()
+    if config != now:
+        other = ", ".join(f"{k}: {config.get(k)} -> {now[k]}" for k in now if config.get(k) != now[k])
+        raise UsageError("a run goes on with the settings it began with", value=other, next="--force starts anew")
+    earlier = records.read_json(out / records.RECORD)
+    if earlier["scene"]["sha256"] != records.scene_hash(scene.path):
+        raise DataError("this is not the scene the run began with", value=scene.path, next="--force starts anew")
+    if earlier["machine"]["isa"] != _isa():
+        note(f"warning: begun with {earlier['machine']['isa']} kernels, going on with {_isa()}: other bits")
+    note(f"going on at step {state.step}")
+    return state
+
+
+def _isa() -> str:
+    from spikerig import _native
+
+    return _native.isa()
+
+
+def _exams(scene: SceneFile) -> list[Exam]:
+    exams, _ = novel_views(scene)
+    return exams[:: max(1, -(-len(exams) // MOST_EXAMS))]
+
+
+def _tell(task: Task, record: dict[str, Any]) -> None:
+    config = task.config
+    length = f"{config.seconds:g} s" if config.seconds > 0 else f"{config.steps} steps"
+    note(f"{config.method} on {record['scene']['name']}: {len(task.targets.views)} views, {length}, seed {config.seed}")
+    note(f"  pose label '{config.pose_label}'; {len(set(task.targets.colour))} sub-pose(s) a view for colour")
+    if config.tfs_weight > 0:
+        note(
+            f"  TfS: w = {config.tfs_weight:g} read as '{config.weight_reading}' = {task.weight:g} on means over pixels; "
+            f"{len(task.targets.tfs)} instant(s), {config.textures}, {config.tfs_domain}"
+        )
+    if (gray := task.targets.gray) is not None and config.tfs_weight > 0:
+        k = ", ".join(f"{x:.3f}" for x in gray.weights)
+        note(f"  gray ({gray.how}): {k}, bias {gray.bias:+.4f}, white = {gray.white:.3f} spikes a tick")
+    for remark in record["remarks"]:
+        note(f"  note: {remark}")
+
+
+@dataclass(slots=True)
+class _Watch:
+    """Called after every step: progress, held-out curve, checkpoints. None of its time counts as training."""
+
+    out: Path
+    task: Task
+    exams: list[Exam]
+    eval_every: float | None
+    checkpoint_every: float
+    looked: float = 0.0
+    saved: float = field(default_factory=time.monotonic)
+    bar: Progress | None = None
+
+    def __call__(self, state: State, fraction: float, loss: float) -> None:
+        config = self.task.config
+        if self.bar is None:
+            total = round(config.seconds) if config.seconds > 0 else config.steps
+            self.bar = Progress("training", total, "s" if config.seconds > 0 else "steps")
+            self.bar.done = int(fraction * total) if config.seconds > 0 else state.step - 1
+        ahead = min(int(fraction * self.bar.total), self.bar.total) if config.seconds > 0 else state.step
+        self.bar.step(ahead - self.bar.done, extra=f"loss {loss:.4f}")
+        if fraction < 1 and self._due(state, fraction):
+            self.look(state, fraction)
+        if time.monotonic() - self.saved >= self.checkpoint_every:
+            self.save(state)
+
+    def _due(self, state: State, fraction: float) -> bool:
+        if self.eval_every is None:
+            return int(fraction * 10) > int(self.looked * 10)
+        last = state.history[-1]["seconds"] if state.history else 0.0
+        return self.eval_every > 0 and state.seconds - last >= self.eval_every
+
+    def look(self, state: State, fraction: float) -> None:
+        """Score the held-out views and add a point to history.json."""
+        self.looked = fraction
+        row: dict[str, Any] = {"seconds": state.seconds, "step": state.step, "fraction": fraction, "psnr": None}
+        if self.exams:
+            row["psnr"] = mean_psnr(self.task.model(state.params), self.exams)
+        state.history.append(row)
+        records.write_json(self.out / records.HISTORY, state.history)
+
+    def save(self, state: State) -> None:
+        """Write a checkpoint."""
+        check_finite(state)
+        save_state(self.out / records.CHECKPOINT, state, self.task.config)
+        self.saved = time.monotonic()
+
+
+def _finish(state: State, watch: _Watch, record: dict[str, Any], ply: bool) -> dict[str, Any]:
+    if not state.history or state.history[-1]["step"] != state.step:
+        watch.look(state, 1.0)
+    watch.save(state)
+    done = {
+        "status": "complete",
+        "steps": state.step,
+        "train_seconds": state.seconds,
+        "splats": len(state.params["means"]),
+    }
+    if "gray" in state.params:
+        done["learned_gray"] = state.params["gray"].tolist()
+    records.write_json(watch.out / records.RECORD, {**record, **done})
+    if ply:
+        model = watch.task.model(state.params)
+        export_ply(watch.out / "splats.ply", model.splats, model.gauge, force=True)
+    psnr = state.history[-1]["psnr"]
+    note(
+        f"{watch.out}: {state.step} steps in {state.seconds:.1f} s"
+        + ("" if psnr is None else f", held-out PSNR {psnr:.2f} dB (pose label '{watch.task.config.pose_label}')")
+    )
+    return {
+        "run": str(watch.out), "method": watch.task.config.method, **done,
+        "pose_label": watch.task.config.pose_label, "psnr": psnr, "seed": watch.task.config.seed,
+        "effective_tfs_weight": watch.task.weight, "gray": record["gray"], "remarks": record["remarks"],
+        "prepare_seconds": record["prepare_seconds"], "model_sha256": model_hash(state),
+    }  # fmt: skip
+
+
+def model_hash(state: State) -> str:
+    """SHA-256 over the parameters, for comparing runs to the bit."""
+    import hashlib
+
+    digest = hashlib.sha256()
+    for name in sorted(state.params):
+        digest.update(name.encode() + state.params[name].detach().contiguous().numpy().tobytes())
+    return digest.hexdigest()

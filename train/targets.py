@@ -1,0 +1,253 @@
+"""What a fit is trained on: per view its frame, and at instants of its exposure the pose, textures, ratio targets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from spikerig.dataset.clocktime import ClockModel
+from spikerig.dataset.errors import DataError, UsageError
+from spikerig.dataset.scene import Floats, View
+from spikerig.dataset.spikes import SpikeStream
+from spikerig.dataset.terminal import Progress
+from spikerig.train.config import FitConfig
+from spikerig.train.gauge import Gauge
+from spikerig.train.gray import Gray, Pairs, solve
+from spikerig.train.losses import mean_weights, ratio_target, srgb_from_linear
+from spikerig.train.trajectory import instant_ns, phases, pose_at, sub_pose
+
+if TYPE_CHECKING:
+    from spikerig.dataset.store import SceneFile
+    from spikerig.dataset.texture import Texture
+
+NEEDS_TRUTH = "a simulated scene (spikerig sim capture); real scenes have no sharp truth"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Instant:
+    """An instant of a view's exposure: pose float32[3,4] in the gauge, TfS targets, colour target.
+
+    `textures` are pairs (texture [H,W] as tfs_domain wants it, mean weights [H,W]); `ratio` is float16[H,W,3] codes
+    (rounding below 1/16 of an 8-bit step), empty where no step uses it.
+    """
+
+    pose: torch.Tensor
+    textures: tuple[tuple[torch.Tensor, torch.Tensor], ...]
+    ratio: torch.Tensor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainView:
+    """A training view: colour target float32[H,W,3] codes, valid bool[H,W] or None for all, instants by phase."""
+
+    name: str
+    frame: torch.Tensor
+    valid: torch.Tensor | None
+    instants: dict[float, Instant]
+
+
+@dataclass(frozen=True, slots=True)
+class Targets:
+    """All training views, the instants each term uses (fractions of the exposure), the converter, remarks."""
+
+    views: tuple[TrainView, ...]
+    colour: tuple[float, ...]
+    tfs: tuple[float, ...]
+    ratio: tuple[float, ...]
+    gray: Gray | None
+    remarks: tuple[str, ...] = field(default=())
+
+
+def spikes_of(view: View) -> SpikeStream:
+    """The spikes of a view that must have them."""
+    if view.spikes is None:
+        raise DataError(
+            f"view '{view.name}' has no spikes, and this method trains on them",
+            next="--method plain or average needs none",
+        )
+    return view.spikes
+
+
+def truth_pose(scene: SceneFile, view: View) -> Floats:
+    """The camera [3,4] at the instant of a view's sharp truth; its mid-exposure pose where no instant is given."""
+    if view.trajectory is None or len(view.trajectory.at_ns) < 2:
+        return view.pose.cam_from_world
+    try:
+        return pose_at(view.trajectory, float(scene.truth_at_ns(view.name)))
+    except UsageError:  # no instant given
+        return view.pose.cam_from_world
+
+
+def spike_tick(view: View, at_ns: float, clock: ClockModel | None) -> float:
+    """The (fractional) tick of a view's spikes at an instant of its frame's clock.
+
+    Raises:
+        DataError: the spikes are on another clock and the scene has no map to it.
+    """
+    stream = spikes_of(view)
+    if stream.clock == view.frame.clock:
+        return stream.tick_at(round(at_ns))
+    if clock is None:
+        raise DataError(
+            f"the frame and spikes of view '{view.name}' are on different clocks",
+            value=f"{view.frame.clock} and {stream.clock}",
+            expected="one clock, or the scene's map between them",
+        )
+    return stream.tick_at(int(clock.device_from_rig(np.int64(round(at_ns)))))
+
+
+def textures_at(stream: Any, tick: float, kind: str, window: int) -> list[Texture]:
+    """The textures of an instant by kind: tfp, tfi, both of them, or raw (the one tick's spikes)."""
+    from spikerig.dataset.texture import tfi, tfp
+
+    made: dict[str, Callable[[], list[Texture]]] = {
+        "tfp": lambda: [tfp(stream, tick, window)],
+        "tfi": lambda: [tfi(stream, tick)],
+        "both": lambda: [tfp(stream, tick, window), tfi(stream, tick)],
+        "raw": lambda: [tfp(stream, tick, 1)],
+    }
+    return made[kind]()
+
+
+def average_texture(found: list[Texture]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Mean over the textures known at each pixel: (light [H,W], known where any is)."""
+    known = np.stack([t.known for t in found])
+    light = np.where(known, np.stack([t.light for t in found]), 0).sum(0)
+    return (light / np.maximum(known.sum(0), 1)).astype(np.float32), known.any(0)
+
+
+def exposure_mean(view: View, clock: ClockModel | None) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Spikes a tick over the whole exposure: (light [H,W], known)."""
+    from spikerig.dataset.texture import window_sum
+
+    stream = spikes_of(view)
+    t0, t1 = (round(spike_tick(view, instant_ns(view.frame, phase), clock)) for phase in (0.0, 1.0))
+    if not (0 <= t0 < t1 <= stream.ticks):
+        raise DataError(
+            f"the spikes of view '{view.name}' do not cover its exposure",
+            value=f"exposure ticks {t0}..{t1}, stream 0..{stream.ticks}",
+            expected="spikes from before its start to after its end",
+            next="spikerig data verify FILE",
+        )
+    lost = any(a < t1 and b > t0 for a, b in stream.lost)
+    light = np.asarray(window_sum(stream, t0, t1), np.float32) / (t1 - t0)
+    return light, np.full(light.shape, not lost)
+
+
+def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
+    """Read the training views of a scene and prepare everything a step needs.
+
+    Args:
+        scene: open scene file.
+        config: of the fit.
+        gauge: poses are given in it.
+
+    Raises:
+        DataError: no training views, no spikes, no trajectory or no truth where the method needs it.
+    Cost: a texture takes milliseconds; memory 12 bytes a pixel and view, +4 a texture, +6 a ratio instant.
+    """
+    if not scene.train:
+        raise DataError("this scene has no training views", value=scene.name, next="spikerig data info FILE")
+    if config.colour_target == "truth" and not scene.has_truth:
+        raise DataError("this method trains on the sharp truth", value=scene.name, expected=NEEDS_TRUTH)
+    colour = phases(config.poses_per_view, config.instants_rule, config.pose_label)
+    tfs = phases(config.textures_per_view, config.instants_rule, config.pose_label) if config.tfs_weight > 0 else ()
+    ratio = phases(config.ratio_instants, "midpoints", config.pose_label) if config.ratio_until > 0 else ()
+    if config.ratio_until >= 1:
+        colour, tfs = ratio, (ratio if tfs else ())
+    pairs, raw, bar = Pairs(), [], Progress("preparing views", len(scene.train), "views")
+    for name in scene.train:
+        raw.append(_read(scene, name, config, (colour, tfs, ratio), pairs))
+        bar.step()
+    gray = solve(pairs, config.gray, scene.light_gain) if config.needs_spikes else None
+    views = tuple(_finish(each, config, gauge, gray, (colour, tfs, ratio)) for each in raw)
+    return Targets(views, colour, tfs, ratio, gray, _remarks(raw))
+
+
+def _remarks(raw: list[dict[str, Any]]) -> tuple[str, ...]:
+    rolling = sum(1 for each in raw if each["row_ns"])
+    if not rolling:
+        return ()
+    return (
+        f"{rolling} frames have a rolling shutter: every row is treated as read when the middle one was "
+        "(poses, textures), so fast shake skews",
+    )
+
+
+def _read(
+    scene: SceneFile, name: str, config: FitConfig, instants: tuple[tuple[float, ...], ...], pairs: Pairs
+) -> dict[str, Any]:
+    from spikerig.dataset.images import linear_from_srgb
+
+    colour, tfs, ratio = instants
+    view = scene.view(name, spikes=config.needs_spikes)
+    decode = np.arange(256) / 255.0
+    if view.frame.transfer == "srgb":
+        decode = linear_from_srgb(decode)
+    light = np.asarray(decode, np.float32)[view.frame.pixels]
+    made: dict[str, Any] = {
+        "name": name,
+        "light": light,
+        "valid": np.array(view.valid),
+        "row_ns": view.frame.row_ns,
+        "pose": {phase: sub_pose(view, phase) for phase in dict.fromkeys((*colour, *tfs, *ratio))},
+        "textures": {},
+    }
+    if config.colour_target == "truth":
+        made["light"] = np.array(scene.truth_light(name), np.float32)
+        made["pose"] = dict.fromkeys(made["pose"], truth_pose(scene, view))
+    if config.needs_spikes:
+        clock = scene.clock
+        mean, known = exposure_mean(view, clock)
+        pairs.add(view.frame.pixels, light, mean, known & view.valid)
+        made["mean"], made["mean_known"] = mean, known
+        for phase in dict.fromkeys((*tfs, *ratio)):
+            tick = spike_tick(view, instant_ns(view.frame, phase), clock)
+            made["textures"][phase] = textures_at(view.spikes, tick, config.textures, config.tfp_window)
+    return made
+
+
+def _finish(
+    raw: dict[str, Any], config: FitConfig, gauge: Gauge, gray: Gray | None, instants: tuple[tuple[float, ...], ...]
+) -> TrainView:
+    _, tfs, ratio = instants
+    light, valid = torch.from_numpy(raw["light"]), raw["valid"]
+    clipped = light.clamp(0, 1)
+    made: dict[float, Instant] = {}
+    for phase, pose in raw["pose"].items():
+        textures, target = (), torch.zeros(0, dtype=torch.half)
+        if gray is not None and phase in raw["textures"]:
+            found = raw["textures"][phase]
+            averaged = average_texture(found)
+            if phase in tfs or (ratio and config.tfs_weight > 0):
+                each = [averaged] if config.tfs_combine == "average" else [(t.light, t.known) for t in found]
+                textures = tuple(_tfs_target(a, k & valid, gray.white, config) for a, k in each)
+            if phase in ratio:
+                target = ratio_target(
+                    clipped,
+                    torch.from_numpy(averaged[0] / np.float32(gray.white)),
+                    torch.from_numpy(raw["mean"] / np.float32(gray.white)),
+                    torch.from_numpy(averaged[1] & raw["mean_known"]),
+                    eps=config.ratio_eps,
+                    low=config.ratio_min,
+                    high=config.ratio_max,
+                ).half()
+        made[phase] = Instant(torch.from_numpy(gauge.pose(pose)), textures, target)
+    everywhere = None if valid.all() else torch.from_numpy(valid)
+    return TrainView(raw["name"], srgb_from_linear(clipped).contiguous(), everywhere, made)
+
+
+def _tfs_target(
+    light: NDArray, known: NDArray[np.bool_], white: float, config: FitConfig
+) -> tuple[torch.Tensor, torch.Tensor]:
+    texture = torch.from_numpy(np.ascontiguousarray(light / np.float32(white), np.float32))
+    if config.highlights == "clip":
+        texture = texture.clamp(max=1.0)
+    if config.tfs_domain in ("encoded", "luma"):
+        texture = srgb_from_linear(texture)
+    return texture.contiguous(), mean_weights(torch.from_numpy(known))
