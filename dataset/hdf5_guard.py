@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+from h5py import h5a, h5d, h5l, h5o, h5s, h5t  # pyright: ignore[reportAttributeAccessIssue]
 
 from spikerig.dataset.errors import DataError, HostError, RigError, UsageError
 
@@ -34,6 +35,7 @@ FILTERS = {1: "deflate", 2: "shuffle", 3: "fletcher32"}
 MAX_OBJECTS, MAX_DEPTH, MAX_ATTRIBUTES, MAX_TEXT = 500_000, 12, 64, 1 << 16
 MAX_CHUNK = 1 << 26
 MAX_INFLATION = 1100  # deflate's limit is 1032
+PATIENCE_S = 15
 _MEMORY = 4 << 30
 _KEPT = 4096
 _healthy: set[str] = set()
@@ -148,16 +150,24 @@ def member(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset:
     where = spot(group, name)
     if not group.id.links.exists(raw):
         raise refuse(where, "it is missing")
-    if group.id.links.get_info(raw).type != h5py.h5l.TYPE_HARD:
+    if group.id.links.get_info(raw).type != h5l.TYPE_HARD:
         raise refuse(where, "a soft, external or user-defined link: only hard links are followed")
-    found = h5py.h5o.open(group.id, raw)
+    found = h5o.open(group.id, raw)
     if isinstance(found, h5py.h5g.GroupID):
         return h5py.Group(found)
-    if not isinstance(found, h5py.h5d.DatasetID):
+    if not isinstance(found, h5d.DatasetID):
         raise refuse(where, "neither a group nor a dataset")
     dataset = h5py.Dataset(found)
     check_dataset(dataset)
     return dataset
+
+
+def names(group: h5py.Group) -> list[str]:
+    """Names of a group's members, all of them UTF-8."""
+    found = [str(name) for name in group]
+    if any("\udc80" <= letter <= "\udcff" for name in found for letter in name):
+        raise refuse(spot(group), "a member's name is not UTF-8")
+    return found
 
 
 def check_dataset(dataset: h5py.Dataset) -> None:
@@ -166,23 +176,23 @@ def check_dataset(dataset: h5py.Dataset) -> None:
     Cost: some 30 us, and 1 us a chunk.
     """
     where, plan, kind = spot(dataset), dataset.id.get_create_plist(), dataset.id.get_type()
-    if not isinstance(kind, h5py.h5t.TypeIntegerID | h5py.h5t.TypeFloatID):
+    if not isinstance(kind, h5t.TypeIntegerID | h5t.TypeFloatID):
         raise refuse(where, f"type {type(kind).__name__}: only integers and floats are read")
     space = dataset.id.get_space()
-    if space.get_simple_extent_type() != h5py.h5s.SIMPLE:
+    if space.get_simple_extent_type() != h5s.SIMPLE:
         raise refuse(where, "a scalar or null dataspace")
     shape = dataset.id.shape
     size = math.prod(shape) * kind.get_size()
     layout = plan.get_layout()
-    if layout == h5py.h5d.VIRTUAL or plan.get_external_count():
+    if layout == h5d.VIRTUAL or plan.get_external_count():
         raise refuse(where, "its data lie in other files")
     codes = [plan.get_filter(i)[0] for i in range(plan.get_nfilters())]
     if any(code not in FILTERS for code in codes):
         raise refuse(where, f"filter {codes}: allowed are {sorted(FILTERS.values())}")
     end = os.fstat(dataset.file.id.get_vfd_handle()).st_size
-    if layout == h5py.h5d.CHUNKED:
+    if layout == h5d.CHUNKED:
         _check_chunks(dataset, size, bool(codes), end)
-    elif dataset.id.get_storage_size() != size or (size and layout == h5py.h5d.CONTIGUOUS and _outside(dataset, end)):
+    elif dataset.id.get_storage_size() != size or (size and layout == h5d.CONTIGUOUS and _outside(dataset, end)):
         raise refuse(where, f"claims {size} bytes of shape {shape} that the file does not hold")
 
 
@@ -192,7 +202,7 @@ def _outside(dataset: h5py.Dataset, end: int) -> bool:
 
 
 def _check_chunks(dataset: h5py.Dataset, size: int, filtered: bool, end: int) -> None:
-    where, chunk, shape = spot(dataset), dataset.chunks, dataset.id.shape
+    where, chunk, shape = spot(dataset), dataset.chunks or (1,), dataset.id.shape
     step = math.prod(chunk) * dataset.id.get_type().get_size()
     need = math.prod(-(-n // c) for n, c in zip(shape, chunk, strict=True))
     held = dataset.id.get_storage_size()
@@ -219,9 +229,7 @@ def walk(group: h5py.Group, depth: int = 0, seen: set[int] | None = None) -> Ite
         raise refuse(spot(group), f"groups nested deeper than {MAX_DEPTH}")
     _note(group, seen)
     yield group
-    for name in group:
-        if any("\udc80" <= letter <= "\udcff" for letter in name):
-            raise refuse(spot(group), "a member's name is not UTF-8")
+    for name in names(group):
         found = member(group, name)
         if isinstance(found, h5py.Group):
             yield from walk(found, depth + 1, seen)
@@ -232,26 +240,26 @@ def walk(group: h5py.Group, depth: int = 0, seen: set[int] | None = None) -> Ite
 
 def _note(thing: h5py.Group | h5py.Dataset, seen: set[int]) -> None:
     _check_attributes(thing)
-    address = h5py.h5o.get_info(thing.id).addr
+    address = h5o.get_info(thing.id).addr
     if address in seen or len(seen) >= MAX_OBJECTS:
         raise refuse(spot(thing), "one object under two names" if address in seen else f"over {MAX_OBJECTS} objects")
     seen.add(address)
 
 
 def _check_attributes(thing: h5py.Group | h5py.Dataset) -> None:
-    count = h5py.h5a.get_num_attrs(thing.id)
+    count = h5a.get_num_attrs(thing.id)
     if count > MAX_ATTRIBUTES:
         raise refuse(spot(thing), f"{count} attributes")
     for i in range(count):
-        check_attribute(thing, h5py.h5a.open(thing.id, index=i))
+        check_attribute(thing, h5a.open(thing.id, index=i))
 
 
-def check_attribute(thing: h5py.Group | h5py.Dataset, attribute: h5py.h5a.AttrID) -> None:
+def check_attribute(thing: h5py.Group | h5py.Dataset, attribute: h5a.AttrID) -> None:
     """Refuse an attribute that is not one integer, float or fixed-length text of at most 64 KiB."""
     kind = attribute.get_type()
-    fixed = isinstance(kind, h5py.h5t.TypeStringID) and not kind.is_variable_str()
-    plain = fixed or isinstance(kind, h5py.h5t.TypeIntegerID | h5py.h5t.TypeFloatID)
-    if not plain or attribute.get_space().get_simple_extent_type() != h5py.h5s.SCALAR or kind.get_size() > MAX_TEXT:
+    fixed = isinstance(kind, h5t.TypeStringID) and not kind.is_variable_str()
+    plain = fixed or isinstance(kind, h5t.TypeIntegerID | h5t.TypeFloatID)
+    if not plain or attribute.get_space().get_simple_extent_type() != h5s.SCALAR or kind.get_size() > MAX_TEXT:
         raise refuse(spot(thing), f"attribute {attribute.name!r} is not one number or short text")
 
 
@@ -267,7 +275,7 @@ def ask_child(task: str, path: str | Path) -> Any:
     Raises:
         DataError: the child refused the file, crashed, hung, or ran out of memory on it.
     """
-    limit_s = 15 + math.ceil(check_plain(path).st_size / 40e6)
+    limit_s = PATIENCE_S + math.ceil(check_plain(path).st_size / 40e6)
     command = [sys.executable, "-P", "-m", "spikerig.dataset.hdf5_guard", task, os.path.abspath(path), str(limit_s)]
     env = os.environ | {"HDF5_PLUGIN_PRELOAD": "::", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     try:
@@ -280,14 +288,16 @@ def ask_child(task: str, path: str | Path) -> Any:
     try:
         answer = json.loads(done.stdout)
     except ValueError as error:
-        raise refuse(path, f"reading it ended the child process ({done.returncode})") from error
+        last = done.stderr.decode(errors="replace").strip().rpartition("\n")[2][:200]
+        raise refuse(path, f"reading it ended the child process ({done.returncode}) {last}") from error
     if fault := answer.get("fault"):
         kind = {"UsageError": UsageError, "HostError": HostError}.get(fault.pop("type"), DataError)
         raise kind(fault.pop("what"), **fault)
     return answer["found"]
 
 
-def _limit(limit_s: int) -> None:
+def limit_itself(limit_s: int) -> None:
+    """Bound this process's memory and CPU time; no core dump, no file written."""
     import resource
 
     for what, bound in (
@@ -315,7 +325,7 @@ def _probe(path: str) -> None:
 def main(words: list[str]) -> int:
     """The child: limit itself, do the task, answer in JSON on stdout."""
     task, path, limit_s = words
-    _limit(int(limit_s))
+    limit_itself(int(limit_s))
     answer: dict[str, Any] = {"found": None}
     try:
         if task == "verify":

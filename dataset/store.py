@@ -17,11 +17,21 @@ from typing import TYPE_CHECKING, Any, cast
 
 import h5py
 import numpy as np
+from h5py import h5a  # pyright: ignore[reportAttributeAccessIssue]
 from numpy.typing import NDArray
 
 from spikerig.dataset.clocktime import ClockModel
 from spikerig.dataset.errors import DataError
-from spikerig.dataset.hdf5_guard import ask_child, check_attribute, hdf5_faults, member, open_file, refuse, spot
+from spikerig.dataset.hdf5_guard import (
+    ask_child,
+    check_attribute,
+    hdf5_faults,
+    member,
+    open_file,
+    refuse,
+    remember,
+    spot,
+)
 from spikerig.dataset.scene import Finding, Scene, Trajectory
 from spikerig.dataset.terminal import note
 
@@ -130,9 +140,9 @@ def parse_schema(text: str) -> dict[str, Row]:
 ROWS: Mapping[str, Row] = parse_schema(SCHEMA)
 
 
-def row_of(path: str) -> Row | None:
+def row_of(path: str | None) -> Row | None:
     """The schema's row of an object in a file, None if it has none: `/views/v007/pose` -> `/views/{view}/pose`."""
-    return ROWS.get(re.sub(r"^(/truth)?/views/[^/]+", lambda m: (m[1] or "") + "/views/{view}", path))
+    return ROWS.get(re.sub(r"^(/truth)?/views/[^/]+", lambda m: (m[1] or "") + "/views/{view}", path or ""))
 
 
 def read_attr(thing: h5py.Group | h5py.Dataset, name: str) -> Any:
@@ -142,18 +152,24 @@ def read_attr(thing: h5py.Group | h5py.Dataset, name: str) -> Any:
         DataError: it is missing, or not of its kind.
     """
     row = cast(Row, row_of(thing.name)).attrs[name]
-    if not h5py.h5a.exists(thing.id, name.encode()):
+    if not h5a.exists(thing.id, name.encode()):
         if row.required:
             raise refuse(spot(thing), f"the attribute {name} is missing")
         return None
-    check_attribute(thing, h5py.h5a.open(thing.id, name.encode()))
-    value = thing.attrs[name]
+    check_attribute(thing, h5a.open(thing.id, name.encode()))
+    value: Any = thing.attrs[name]
     kind = "text" if isinstance(value, bytes | str) else "int" if isinstance(value, np.integer) else "float"
     if kind != row.dtype:
         raise refuse(spot(thing), f"the attribute {name} is {value!r}, where {row.dtype} belongs")
     if kind == "text":
         return value.decode() if isinstance(value, bytes) else str(value)
     return int(value) if kind == "int" else float(value)
+
+
+def stored_digest(thing: h5py.Group | h5py.Dataset) -> str:
+    """The digest an object carries, "" if none."""
+    value: Any = thing.attrs.get(DIGEST, b"")
+    return value.decode() if isinstance(value, bytes) else str(value)
 
 
 def group_at(parent: h5py.Group, name: str) -> h5py.Group:
@@ -177,12 +193,17 @@ def dataset_at(parent: h5py.Group, name: str) -> h5py.Dataset:
     found = member(parent, name)
     if not isinstance(found, h5py.Dataset):
         raise refuse(spot(found), "a group where a dataset belongs")
+    check_shape(found)
+    return found
+
+
+def check_shape(found: h5py.Dataset) -> None:
+    """Refuse a dataset that is not of the type and shape of its row."""
     row = row_of(found.name)
     if row is None or found.dtype != np.dtype("<" + row.dtype) or len(found.shape) != len(row.shape):
         raise refuse(spot(found), f"{found.dtype} of shape {found.shape}: not what the schema says")
     if any(isinstance(want, int) and want != n for want, n in zip(row.shape, found.shape, strict=True)):
         raise refuse(spot(found), f"shape {found.shape}, where the schema says {row.shape}")
-    return found
 
 
 def read_json(parent: h5py.Group, name: str) -> dict[str, Any]:
@@ -203,8 +224,8 @@ def has(parent: h5py.Group, name: str) -> bool:
 
 def read_clock(group: h5py.Group) -> ClockModel:
     """A clock model as it was written."""
-    knots = [read_array(group, name) for name in ("device_ns", "rig_ns", "sigma_ns")]
-    return ClockModel(*knots, read_attr(group, "drift_ppm"))
+    device, rig, sigma = (read_array(group, name) for name in ("device_ns", "rig_ns", "sigma_ns"))
+    return ClockModel(device, rig, sigma, read_attr(group, "drift_ppm"))
 
 
 def read_trajectory(group: h5py.Group) -> Trajectory:
@@ -242,7 +263,7 @@ def open_scene(path: str | Path, *, partial: bool = False) -> SceneFile:
 
 def check_version(file: h5py.File) -> None:
     """Refuse a file that is not RS-3D, or whose major version is newer than this reader's; note a newer minor one."""
-    if not h5py.h5a.exists(file.id, b"format") or read_attr(file, "format") != FORMAT:
+    if not h5a.exists(file.id, b"format") or read_attr(file, "format") != FORMAT:
         raise DataError("not an RS-3D scene", value=file.filename, cause="an HDF5 file of another kind")
     found = read_attr(file, "version")
     match = re.fullmatch(r"(\d{1,4})\.(\d{1,4})", found)
@@ -288,7 +309,9 @@ def verify_scene(path: str | Path) -> list[Finding]:
 
     Cost: reads the whole file once.
     """
-    return [Finding(**found) for found in ask_child("verify", path)]
+    found = ask_child("verify", path)
+    remember(path)  # the child walked and read it all
+    return [Finding(**one) for one in found]
 
 
 def __getattr__(name: str) -> Any:

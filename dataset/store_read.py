@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.clocktime import ClockModel, ns_from_tick
 from spikerig.dataset.errors import DataError, UsageError
-from spikerig.dataset.hdf5_guard import hdf5_faults, refuse, spot
+from spikerig.dataset.hdf5_guard import hdf5_faults, names, refuse, spot
 from spikerig.dataset.scene import Camera, Frame, Points, Pose, Scene, Trajectory, Truth, View
 from spikerig.dataset.spikes import SpikeStream
 from spikerig.dataset.store import (
-    DIGEST,
+    FORMAT,
     NAME,
     ROWS,
     dataset_at,
@@ -27,6 +27,7 @@ from spikerig.dataset.store import (
     read_clock,
     read_json,
     read_trajectory,
+    stored_digest,
 )
 
 
@@ -58,11 +59,11 @@ class SceneFile:
         self.info: dict[str, Any] = read_json(file, "info") if has(file, "info") or not partial else {}
         views = group_at(file, "views")
         found: list[tuple[int, str, str]] = []
-        for name in views:
+        for name in names(views):
             if not NAME.fullmatch(name):
                 raise refuse(spot(views, repr(name)), "not a view's name")
             group = group_at(views, name)
-            if self.status == "complete" or DIGEST in group.attrs:  # the digest is written last
+            if self.status == "complete" or stored_digest(group):  # a view's digest is written last
                 found.append((read_attr(group, "order"), name, read_attr(group, "split")))
         self.names = tuple(name for _, name, _ in sorted(found))
         splits = {name: split for _, name, split in found}
@@ -115,7 +116,8 @@ class SceneFile:
         with hdf5_faults(self.path):
             shape = (self.camera.height, self.camera.width)
             pixels = read_array(group, "pixels", (*shape, 3))
-            marks = [read_attr(group["pixels"], key) for key in ROWS["/views/{view}/pixels"].attrs]
+            frame = dataset_at(group, "pixels")
+            marks = [read_attr(frame, key) for key in ROWS["/views/{view}/pixels"].attrs]
             path = read_trajectory(group_at(group, "trajectory")) if has(group, "trajectory") else None
             return View(
                 name,
@@ -159,15 +161,20 @@ class SceneFile:
         lost = np.clip(lost - (t0 or 0), 0, len(bits))
         return SpikeStream(bits, width, rate_hz, t0_ns, clock, lost[lost[:, 0] < lost[:, 1]])
 
-    def _truth(self, name: str, key: str) -> h5py.Group:
-        group = self._group(name, truth=True) if self.has_truth and self._knows(name) else None
-        if group is None or not (has(group, key) or key in group.attrs):
-            raise UsageError(f"there is no true {key} of this view", value=name, cause="not a simulated view")
-        return group
-
-    def _knows(self, name: str) -> bool:
+    def has_true(self, name: str, key: str) -> bool:
+        """Whether the truth knows the "light", the instant "at_ns" or the "trajectory" of a view."""
+        self._group(name)
         with hdf5_faults(self.path):
-            return has(group_at(group_at(self._file, "truth"), "views"), name)
+            views = group_at(group_at(self._file, "truth"), "views") if self.has_truth else None
+            if views is None or not has(views, name):
+                return False
+            group = group_at(views, name)
+            return has(group, key) or key in group.attrs
+
+    def _truth(self, name: str, key: str) -> h5py.Group:
+        if not self.has_true(name, key):
+            raise UsageError(f"there is no true {key} of this view", value=name, cause="not a simulated view")
+        return self._group(name, truth=True)
 
     def truth_light(self, name: str) -> NDArray[np.float32]:
         """Sharp linear light of a view, float32[H,W,3], at `truth_at_ns`; a UsageError where there is none."""
@@ -194,17 +201,44 @@ class SceneFile:
             return None
         with hdf5_faults(self.path):
             group = group_at(self._file, "truth")
-            views = group_at(group, "views")
-            known = {name: group_at(views, name) for name in self.names if has(views, name)}
             return Truth(
-                {name: self.truth_light(name) for name, g in known.items() if has(g, "light")},
-                {name: self.truth_at_ns(name) for name, g in known.items() if "at_ns" in g.attrs},
-                {name: self.truth_trajectory(name) for name, g in known.items() if has(g, "trajectory")},
+                {name: self.truth_light(name) for name in self.names if self.has_true(name, "light")},
+                {name: self.truth_at_ns(name) for name in self.names if self.has_true(name, "at_ns")},
+                {name: self.truth_trajectory(name) for name in self.names if self.has_true(name, "trajectory")},
                 read_clock(group_at(group, "clock")),
                 read_json(group, "effects"),
                 read_attr(group, "seed"),
                 self.truth_label,
             )
+
+    def describe(self) -> dict[str, Any]:
+        """What a person asks first, JSON-ready: sizes, counts, names, what is there; nothing large is read."""
+        ticks: dict[str, int] = {}
+        with hdf5_faults(self.path):
+            for name in self.names:
+                group = self._group(name)
+                ticks[name] = dataset_at(group, "spikes").shape[0] if has(group, "spikes") else 0
+            points = self.points
+            return {
+                "format": f"{FORMAT} {read_attr(self._file, 'version')}",
+                "writer": read_attr(self._file, "writer"),
+                "status": self.status,
+                "name": self.name,
+                "width": self.camera.width,
+                "height": self.camera.height,
+                "views": len(self.names),
+                "train": list(self.train),
+                "test": list(self.test),
+                "ticks": ticks,
+                "points": 0 if points is None else len(points.xyz),
+                "points_source": None if points is None else points.source,
+                "light_gain": self.light_gain,
+                "truth": self.truth_label or None,
+                "clock": self.clock is not None,
+                "calibration": self.calibration is not None,
+                "sha256": stored_digest(self._file) or None,
+                "info": self.info,
+            }
 
     def read(self) -> Scene:
         """The whole scene in memory."""

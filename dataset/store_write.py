@@ -23,9 +23,9 @@ from numpy.typing import ArrayLike
 
 from spikerig.dataset.clocktime import ClockModel
 from spikerig.dataset.errors import HostError, NumericsError, UsageError
-from spikerig.dataset.hdf5_guard import MAX_TEXT, remember
+from spikerig.dataset.hdf5_guard import MAX_TEXT, member, names, remember
 from spikerig.dataset.scene import Camera, Points, Scene, Trajectory, Truth, View
-from spikerig.dataset.store import DIGEST, FORMAT, NAME, VERSION, row_of
+from spikerig.dataset.store import DIGEST, FORMAT, NAME, VERSION, row_of, stored_digest
 from spikerig.dataset.terminal import jsonable
 
 _BLOCK = 1 << 24
@@ -84,7 +84,7 @@ class SceneWriter:
         put_attr(group, "height", camera.height)
         put(group, "K", camera.K)
         put(group, "distortion", camera.distortion)
-        root.create_group("views")
+        self._views = root.create_group("views")
         if truth is not None:
             self._put_truth(truth)
         root.flush()
@@ -121,14 +121,14 @@ class SceneWriter:
         """
         self._check(view, light is not None or at_ns is not None or trajectory is not None)
         with disk_faults(self.path):
-            self._put_view(view)
+            group = self._views.create_group(view.name)
+            self._put_view(group, view)
             self._put_view_truth(view.name, light, at_ns, trajectory)
-            seal(self._file["views"][view.name])
+            seal(group)
             self.names.append(view.name)
             self._file.flush()
 
-    def _put_view(self, view: View) -> None:
-        group = self._file["views"].create_group(view.name)
+    def _put_view(self, group: h5py.Group, view: View) -> None:
         put_attr(group, "split", view.split)
         put_attr(group, "order", len(self.names))
         frame = view.frame
@@ -169,7 +169,7 @@ class SceneWriter:
         put_attr(group, "label", truth.label)
         put_json(group, "effects", truth.effects)
         _put_clock(group, truth.clock)
-        group.create_group("views")
+        self._true_views = group.create_group("views")
 
     def _put_view_truth(self, name: str, light: ArrayLike | None, at_ns: int | None, path: Trajectory | None) -> None:
         truth = self.truth
@@ -180,7 +180,7 @@ class SceneWriter:
         path = truth.trajectories.get(name) if path is None else path
         if light is None and at_ns is None and path is None:
             return
-        group = self._file["truth/views"].create_group(name)
+        group = self._true_views.create_group(name)
         put_attr(group, "at_ns", at_ns)
         if light is not None:
             array = np.asarray(light, np.float32)
@@ -267,7 +267,7 @@ def write(path: str | Path, scene: Scene, force: bool) -> None:
 
 def put(parent: h5py.Group, name: str, values: ArrayLike) -> h5py.Dataset:
     """Store an array of the schema's type, contiguous and unfiltered."""
-    row = row_of(f"{parent.name.rstrip('/')}/{name}")
+    row = row_of(f"{(parent.name or '').rstrip('/')}/{name}")
     if row is None:
         raise UsageError("not in the schema", value=f"{parent.name}/{name}")
     return parent.create_dataset(name, data=np.ascontiguousarray(values, np.dtype("<" + row.dtype)))
@@ -321,32 +321,27 @@ def digest(thing: h5py.Group | h5py.Dataset) -> str:
     """
     total = hashlib.sha256()
     for name in sorted(set(thing.attrs) - {DIGEST}):
-        value = thing.attrs[name]
+        value: Any = thing.attrs[name]
         plain = value.decode() if isinstance(value, bytes) else value.hex() if hasattr(value, "hex") else int(value)
         total.update(f"@{name}={plain}\0".encode())
     if isinstance(thing, h5py.Group):
         for name in sorted(thing):
-            total.update(f"{name}:{_text(thing[name].attrs.get(DIGEST, b''))}\0".encode())
+            total.update(f"{name}:{stored_digest(member(thing, name))}\0".encode())
         return total.hexdigest()
     total.update(f"{thing.dtype.str}{thing.shape}\0".encode())
-    if not thing.size:
-        return total.hexdigest()
-    rows = max(1, _BLOCK // max(1, thing.nbytes // thing.shape[0]))
-    for k in range(0, thing.shape[0], rows):
+    rows = max(1, _BLOCK // max(1, thing.nbytes // max(1, thing.shape[0])))
+    for k in range(0, thing.shape[0] if thing.size else 0, rows):
         total.update(np.ascontiguousarray(thing[k : k + rows]).data)
     return total.hexdigest()
-
-
-def _text(value: bytes | str) -> str:
-    return value.decode() if isinstance(value, bytes) else value
 
 
 def seal(thing: h5py.Group | h5py.Dataset) -> None:
     """Give an object, and everything below it that has none, its digest; members first."""
     if isinstance(thing, h5py.Group):
-        for name in thing:
-            if DIGEST not in thing[name].attrs:
-                seal(thing[name])
+        for name in names(thing):
+            below = member(thing, name)
+            if not stored_digest(below):
+                seal(below)
     put_attr(thing, DIGEST, digest(thing))
 
 

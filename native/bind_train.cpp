@@ -110,6 +110,26 @@ void render_backward(Render &render, In means, In quats, In log_scales, In logit
                             g_camera.data());
 }
 
+double l1_ssim(In image, In target, nb::object valid, nb::object grad, double l1_scale, double ssim_scale) {
+  expect(image.ndim() == 3 && image.shape(2) == 3 && image.size() == target.size() && image.size() > 0, "pictures");
+  spikerig::SsimPlan plan{};
+  plan.image = image.data(), plan.target = target.data();
+  plan.height = static_cast<int>(image.shape(0)), plan.width = static_cast<int>(image.shape(1));
+  plan.l1_scale = l1_scale, plan.ssim_scale = ssim_scale;
+  if (!valid.is_none()) {
+    Mask mask = nb::cast<Mask>(valid);
+    expect(3 * mask.size() == image.size(), "valid");
+    plan.valid = mask.data();
+  }
+  if (!grad.is_none()) {
+    Out out = nb::cast<Out>(grad);
+    expect(out.size() == image.size(), "grad");
+    plan.grad = out.data();
+  }
+  nb::gil_scoped_release release;
+  return spikerig::l1_ssim(plan);
+}
+
 }  // namespace
 
 void bind_train(nb::module_ &m) {
@@ -125,4 +145,6 @@ void bind_train(nb::module_ &m) {
   m.def("render_backward", &render_backward, "render"_a, "means"_a, "quats"_a, "log_scales"_a, "logits"_a, "sh"_a,
         "image"_a, "alpha"_a, "image_grad"_a, "alpha_grad"_a, "g_means"_a, "g_quats"_a, "g_log_scales"_a, "g_logits"_a,
         "g_sh"_a, "g_means2d"_a, "g_camera"_a, "Gradients of the picture render_forward drew.");
+  m.def("l1_ssim", &l1_ssim, "image"_a, "target"_a, "valid"_a.none(), "grad"_a.none(), "l1_scale"_a, "ssim_scale"_a,
+        "l1_scale * sum |image - target| + ssim_scale * sum (1 - ssim) over valid channels; grad is written.");
 }

@@ -105,13 +105,18 @@ struct Frame {  // one picture on its way
   const float *image_grad = nullptr, *alpha_grad = nullptr;  // same shapes
 };
 
+constexpr int BAND = 32;       // picture rows of one part of the SSIM
+constexpr int TAPS = 11;       // its window, sigma 1.5, zero outside the picture (Inria's)
+constexpr int ROW_PAD = 32;    // (at least 15) zeros before and after a row of channels
+
 struct SsimPlan {
   const float *image, *target;  // [H, W, 3]
-  const uint8_t *valid;         // [H, W] or null
+  const uint8_t *valid;         // [H, W] or null: other pixels count as outside the picture
   float *grad;                  // [H, W, 3] or null
-  float *partials;              // [3, H, 3 W] or null
   int width, height;
-  double l1_scale, ssim_scale;  // the loss = l1_scale * sum |image - target| - ssim_scale * sum ssim
+  double l1_scale, ssim_scale;  // loss = l1_scale * sum |image - target| + ssim_scale * sum (1 - ssim), valid ones
+  int stride;                   // floats of a padded row of channels
+  float *blurred;               // [3, H, stride]: d ssim / d (mean, square, product), blurred along rows
 };
 
 #define SPIKERIG_TRAIN_KERNELS(isa)                                                                                \
@@ -120,11 +125,15 @@ struct SsimPlan {
   void raster_tile(Frame &frame, int tile);                                                                        \
   void raster_tile_back(Frame &frame, int tile);                                                                   \
   void project_back(Frame &frame, const SplatGrads &grads, int64_t begin, int64_t end, double *camera_part);       \
+  void ssim_band(const SsimPlan &plan, int band, float *scratch, double *sums); /* sums of |.| and of 1 - ssim */ \
+  void ssim_band_back(const SsimPlan &plan, int band);                                                             \
   }
 SPIKERIG_EACH_ISA(SPIKERIG_TRAIN_KERNELS)
 
 bool render_forward(Frame &frame);  // false: a parameter is not finite, nothing is drawn
 void render_backward(Frame &frame, const SplatGrads &grads, double *camera_grad);  // camera_grad[12]
 int64_t consulted(const Frame &frame);  // sum over pixels of listed splats up to where the pixel was finished
+
+double l1_ssim(SsimPlan plan);  // the loss; writes plan.grad unless it is null
 
 }  // namespace spikerig

@@ -24,9 +24,9 @@ from spikerig.train import checkpoint
 from spikerig.train.config import FitConfig, effective_weight
 from spikerig.train.densify import jolt, relocate
 from spikerig.train.gauge import Gauge
-from spikerig.train.kernels import l1_ssim
 from spikerig.train.losses import average_exposure, l2_loss, mean_weights, tfs_loss
 from spikerig.train.model import BACKGROUNDS, Model, splats_of
+from spikerig.train.ssim import l1_ssim
 from spikerig.train.targets import Targets, TrainView
 
 RATES = {

@@ -145,10 +145,35 @@ def render_backward(
     """Gradients of what `render_forward` drew, given those of the image and of alpha.
 
     Returns:
-        (gradients of the five arrays, of the screen positions [N,2] in loss per pixel, of cam_from_world [3,4] float64).
+        (gradients of the five arrays; of the screen positions [N,2], in loss per pixel; of cam_from_world [3,4],
+        float64).
     """
     grads = [np.empty_like(a) for a in arrays]
     screen = np.empty((len(arrays[3]), 2), np.float32)
     camera = np.empty(12, np.float64)
     _native.render_backward(state, *arrays, image, alpha, image_grad, alpha_grad, *grads, screen, camera)
     return grads, screen, camera.reshape(3, 4)
+
+
+def l1_ssim(
+    image: np.ndarray, target: np.ndarray, valid: np.ndarray | None, ssim_weight: float, *, grad: bool
+) -> tuple[float, np.ndarray | None]:
+    """(1 - w) mean |image - target| + w mean (1 - SSIM), and its gradient in `image`.
+
+    Args:
+        image, target: float32 [H,W,3], range 1.
+        valid: bool [H,W] or None; pixels that are not valid count as outside the picture, and the means leave them out.
+        ssim_weight: w.
+        grad: whether the gradient is wanted.
+
+    Returns:
+        (loss, gradient [H,W,3] or None).
+
+    Edges: no valid pixel: 0 and a zero gradient.
+    """
+    count = 3 * (image.shape[0] * image.shape[1] if valid is None else int(np.count_nonzero(valid)))
+    out = np.empty_like(image) if grad else None
+    mask = None if valid is None else np.ascontiguousarray(valid).view(np.uint8)
+    each = 1 / max(count, 1)
+    loss = _native.l1_ssim(image, target, mask, out, (1 - ssim_weight) * each, ssim_weight * each)
+    return loss, out

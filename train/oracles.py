@@ -199,3 +199,35 @@ def render(
     p = project(splats, K, width, height, cam_from_world, degree, antialias, near)
     light = torch.as_tensor(background, dtype=p.centre.dtype)
     return (raster_tiled if tiled else raster)(p, width, height, light)
+
+
+def ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """SSIM [H,W,3] of two pictures [H,W,3] of range 1: 11 x 11 Gaussian window, sigma 1.5, zero outside (Inria's).
+
+    Source: Wang et al. 2004, with variances clamped at 0.
+    """
+    taps = torch.exp(-((torch.arange(11, dtype=image.dtype) - 5) ** 2) / (2 * 1.5**2))
+    taps = taps / taps.sum()
+
+    def mean(x: torch.Tensor) -> torch.Tensor:
+        planes = x.permute(2, 0, 1)[:, None]
+        planes = torch.nn.functional.conv2d(planes, taps.reshape(1, 1, 11, 1), padding=(5, 0))
+        return torch.nn.functional.conv2d(planes, taps.reshape(1, 1, 1, 11), padding=(0, 5))[:, 0].permute(1, 2, 0)
+
+    ma, mb = mean(image), mean(target)
+    saa = (mean(image * image) - ma * ma).clamp(min=0)
+    sbb = (mean(target * target) - mb * mb).clamp(min=0)
+    sab = mean(image * target) - ma * mb
+    c1, c2 = 0.01**2, 0.03**2
+    return (2 * ma * mb + c1) * (2 * sab + c2) / ((ma * ma + mb * mb + c1) * (saa + sbb + c2))
+
+
+def l1_ssim(
+    image: torch.Tensor, target: torch.Tensor, ssim_weight: float = 0.2, valid: torch.Tensor | None = None
+) -> torch.Tensor:
+    """(1 - w) mean |image - target| + w mean (1 - SSIM); pixels not valid count as outside the picture."""
+    on = torch.ones(image.shape[:2], dtype=torch.bool) if valid is None else valid
+    if not on.any():
+        return image.sum() * 0
+    a, b = torch.where(on[:, :, None], image, 0.0), torch.where(on[:, :, None], target, 0.0)
+    return (1 - ssim_weight) * (a - b)[on].abs().mean() + ssim_weight * (1 - ssim_map(a, b))[on].mean()

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.scene import Camera
-from spikerig.rigctl.sim.hits import HIT, TINY, Axes, Floats, dot, screen
+from spikerig.rigctl.sim.hits import HIT, TINY, Axes, Floats, screen
 from spikerig.rigctl.sim.pattern import albedo
-from spikerig.rigctl.sim.shade import TEXELS, Face, LightMap, faces_of, irradiance, light_map
+from spikerig.rigctl.sim.shade import TEXELS, Face, LightMap, faces_of, light_map
 from spikerig.rigctl.sim.world import Solid, World
 
-BAND = 16384  # rays cast at once: a band of rows that stays in the second-level cache
+BAND = 32768  # rays cast at once: a band of rows that stays in the second-level cache
 
 
 class Stage:
@@ -104,23 +104,15 @@ class Stage:
     def _reflected(self, number: int, p: Axes, o: Axes) -> Floats:
         """Light float32[3,n] that points of one face send to a camera at `o`."""
         face, world = self.faces[number], self.world
-        q = [p[a] - np.float32(face.centre[a]) if face.centre[a] else p[a] for a in range(3)]
-        if face.normal is None:
-            n = [c * np.float32(1 / face.radius) for c in q]
-            u = np.arctan2(q[1], q[0]) * np.float32(face.radius)
-            v = np.arcsin(np.clip(n[2], -1, 1)) * np.float32(face.radius)
-        else:
-            n, u, v = [], dot(q, face.along_u), dot(q, face.along_v)
+        u, v = face.coordinates(p)
         colour = albedo(face.texture, face.table, u, v)
         if face.texture.emit > 0:
             return colour * np.float32(face.texture.emit)
-        if face.normal is None:
-            direct, open_ = irradiance(world, p, n)
-        else:
-            flip = sum((float(o[a]) - face.centre[a]) * face.normal[a] for a in range(3)) < 0
-            if (number, flip) not in self._maps:
-                self._maps[number, flip] = light_map(world, face, flip, self.texel)
-            direct, open_ = self._maps[number, flip].at(u, v)
+        normal = face.normal or (0.0, 0.0, 0.0)
+        flip = sum((float(o[a]) - face.centre[a]) * normal[a] for a in range(3)) < 0
+        if (number, flip) not in self._maps:
+            self._maps[number, flip] = light_map(world, face, flip, self.texel)
+        direct, open_ = self._maps[number, flip].at(u, v)
         out = np.empty((3, direct.size), np.float32)
         for a in range(3):
             np.multiply(open_, np.float32(world.ambient[a]), out=out[a])

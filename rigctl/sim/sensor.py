@@ -15,7 +15,7 @@ from spikerig.rigctl.sim.effects import Hooks
 from spikerig.rigctl.sim.spec import Sensor
 
 Floats = NDArray[np.float32]
-BLOCK = 2_000_000  # pixel-ticks of light made at once where an effect needs every tick
+BLOCK = 300_000  # pixel-ticks of light made at once where an effect needs every tick
 
 
 @dataclass(frozen=True, slots=True)

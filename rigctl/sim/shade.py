@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.rigctl.sim.hits import NEAR, Axes, Floats, box_frame, dot3, vec3
+from spikerig.rigctl.sim.hits import NEAR, Axes, Floats, box_frame, dot, dot3, vec3
 from spikerig.rigctl.sim.pattern import Texture, lattice
 from spikerig.rigctl.sim.world import Box, Rect, Room, Solid, Sphere, Vec3, World
 
@@ -24,7 +24,7 @@ class Face:
         centre: where u = v = 0.
         along_u, along_v: unit vectors.
         lo, hi: extent in u and v.
-        radius: of a sphere.
+        radius: of a sphere, whose u and v are azimuth and latitude times the radius.
     """
 
     texture: Texture
@@ -37,12 +37,33 @@ class Face:
     hi: tuple[float, float]
     radius: float = 0.0
 
+    def coordinates(self, p: Axes) -> tuple[Floats, Floats]:
+        """u and v of points, float32[n] each."""
+        q = [p[a] - np.float32(self.centre[a]) if self.centre[a] else p[a] for a in range(3)]
+        if self.normal is not None:
+            return dot(q, self.along_u), dot(q, self.along_v)
+        r = np.float32(self.radius)
+        return np.arctan2(q[1], q[0]) * r, np.arcsin(np.clip(q[2] / r, -1, 1)) * r
+
+    def place(self, u: NDArray[np.float64], v: NDArray[np.float64], flip: bool) -> tuple[Axes, Axes]:
+        """Points and unit normals at coordinates; the other side's normals where `flip`. The inverse of the above."""
+        c = np.array(self.centre)[:, None]
+        if self.normal is None:
+            a, b = u / self.radius, v / self.radius
+            n = np.stack([np.cos(a) * np.cos(b), np.sin(a) * np.cos(b), np.sin(b)])
+            p = c + n * self.radius
+        else:
+            p = c + np.array(self.along_u)[:, None] * u + np.array(self.along_v)[:, None] * v
+            n = np.broadcast_to(np.array(self.normal)[:, None] * (-1 if flip else 1), p.shape)
+        return list(p.astype(np.float32)), list(n.astype(np.float32))
+
 
 def faces_of(solid: Solid) -> list[Face]:
     """The faces of a solid, in the order its hit function numbers them."""
     if isinstance(solid, Sphere):
-        skin = solid.texture
-        return [Face(skin, lattice(skin), None, solid.centre, (1, 0, 0), (0, 1, 0), (0, 0), (0, 0), solid.radius)]
+        skin, r = solid.texture, solid.radius
+        lo, hi = (-np.pi * r, -np.pi * r / 2), (np.pi * r, np.pi * r / 2)
+        return [Face(skin, lattice(skin), None, solid.centre, (1, 0, 0), (0, 1, 0), lo, hi, r)]
     if isinstance(solid, Rect):
         edges = [np.array(v) for v in (solid.right, solid.up)]
         half = tuple(float(np.linalg.norm(v)) for v in edges)
@@ -103,7 +124,7 @@ def irradiance(world: World, p: Axes, n: Axes) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightMap:
-    """Irradiance of a flat face, tabulated: [rows (v), columns (u)] texels over its extent, read bilinearly.
+    """Irradiance of a face, tabulated: [rows (v), columns (u)] texels over its extent, read bilinearly.
 
     A texel is the mean of 2x2 points, so shadow edges are as soft as a texel: those of a lamp of some size.
     """
@@ -145,16 +166,15 @@ def _bilinear(table: Floats, corners: list[NDArray[np.intp]], x: Floats, y: Floa
 
 
 def light_map(world: World, face: Face, flip: bool, texel: float) -> LightMap:
-    """The table of a flat face, seen from the side of its normal or (`flip`) from the other; texels of that size."""
+    """The table of a face, seen from the side of its normal or (`flip`) from the other; texels of that size."""
     counts = [int(np.clip(np.ceil((face.hi[k] - face.lo[k]) / texel), 16, 4 * TEXELS)) for k in (0, 1)]
     spots = [
         face.lo[k] + (np.arange(2 * counts[k]) + 0.5) * ((face.hi[k] - face.lo[k]) / (2 * counts[k])) for k in (0, 1)
     ]
     u, v = np.meshgrid(*spots)
-    p = [(face.centre[a] + face.along_u[a] * u + face.along_v[a] * v).astype(np.float32).reshape(-1) for a in range(3)]
-    n = [np.float32(-c if flip else c) for c in face.normal or (0, 0, 0)]
+    p, n = face.place(u.reshape(-1), v.reshape(-1), flip)
     tables = []
-    for part in irradiance(world, p, n):  # type: ignore[arg-type]
+    for part in irradiance(world, p, n):
         cells = part.reshape(counts[1], 2, counts[0], 2)
         tables.append(cells.mean((1, 3), dtype=np.float32).reshape(-1))
     scale = (counts[0] / (face.hi[0] - face.lo[0]), counts[1] / (face.hi[1] - face.lo[1]))

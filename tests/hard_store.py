@@ -1,0 +1,359 @@
+"""Hard inputs of the scene file and the pictures: a scene with everything in it, and files made to do harm."""
+
+import os
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from spikerig.dataset.clocktime import ClockModel
+from spikerig.dataset.scene import Camera, Frame, Points, Pose, Scene, Trajectory, Truth, View
+from spikerig.dataset.spikes import SpikeStream
+
+H, W = 13, 21
+
+
+def turn(angle: float, shift: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0, s, shift], [0, 1, 0, -shift], [-s, 0, c, 2.0]])
+
+
+def path(k: int, cov: bool) -> Trajectory:
+    poses = np.stack([turn(0.1 * i, 0.01 * i) for i in range(k)])
+    noise = np.random.default_rng(k).random((k, 6, 6)) if cov else None
+    return Trajectory(np.arange(k) * 1_000_003 - 7, poses, noise)
+
+
+def stream(ticks: int, seed: int, rate_hz: float | None = 40_000.0) -> SpikeStream:
+    on = np.random.default_rng(seed).random((ticks, H, W)) < 0.2
+    lost = np.array([[3, 9], [20, 21]]) if ticks > 30 else np.zeros((0, 2), int)
+    for a, b in lost:
+        on[a:b] = False
+    return SpikeStream(np.packbits(on, axis=2, bitorder="little"), W, rate_hz, -1234567, "spike-clock", lost)
+
+
+def view(i: int) -> View:
+    rng = np.random.default_rng(100 + i)
+    shape = (H, W)
+    frame = Frame(
+        rng.integers(0, 256, (*shape, 3), dtype=np.uint8), ["srgb", "linear"][i % 2], 5_000 + i, 7_500_000, 21, "cam"
+    )
+    spikes = None if i == 3 else stream(40 if i else 0, i, None if i == 2 else 40_000.1)
+    return View(
+        ["a", "v-01.x", "_b", "Z9"][i],
+        frame,
+        spikes,
+        rng.random(shape, dtype=np.float32) * 100,
+        rng.random(shape) < 0.5,
+        Pose(turn(0.3 * i, i)),
+        None if i == 1 else path(4, cov=i == 0),
+        "test" if i == 3 else "train",
+    )
+
+
+def full_scene() -> Scene:
+    rng = np.random.default_rng(5)
+    views = tuple(view(i) for i in range(4))
+    clock = ClockModel(np.array([0, 10**15]), np.array([5, 10**15 + 30_000]), np.array([1.5, 2.5]), 12.5)
+    truth = Truth(
+        {name: rng.standard_normal((H, W, 3)).astype(np.float32) for name in ("a", "Z9")},
+        {"a": 2**60 + 1, "_b": -3},
+        {"a": path(9, cov=False)},
+        clock,
+        {"shot": {"threshold_e": 560.25}, "list": [1, None, True, "ü"]},
+        2**62,
+        "first",
+    )
+    points = Points(rng.standard_normal((17, 3)), rng.integers(0, 256, (17, 3), dtype=np.uint8), "simulator")
+    camera = Camera(np.array([[30.0, 0, 10.5], [0, 31, 6.5], [0, 0, 1]]), np.array([0.1, -0.2, 0.3, 1e-17]), W, H)
+    info = {"made": "üß", "n": [1, 2.5, None], "deep": {"k": True}}
+    return Scene("scène 1", camera, views, points, truth, 0.1 + 0.2, info, clock, {"id": "cal-1", "mirror": {"arm": 1}})
+
+
+def same(a: Any, b: Any, where: str = "scene") -> None:
+    """Assert that two records are equal to the last bit, dtypes included."""
+    assert type(a) is type(b) or (isinstance(a, dict) and isinstance(b, dict)), where
+    if is_dataclass(a):
+        for f in fields(a):
+            same(getattr(a, f.name), getattr(b, f.name), f"{where}.{f.name}")
+    elif isinstance(a, np.ndarray):
+        assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes()), where
+    elif isinstance(a, dict):
+        assert a.keys() == b.keys(), where
+        for key in a:
+            same(a[key], b[key], f"{where}[{key}]")
+    elif isinstance(a, tuple):
+        assert len(a) == len(b), where
+        for i, (x, y) in enumerate(zip(a, b, strict=True)):
+            same(x, y, f"{where}[{i}]")
+    else:
+        assert a == b, where
+
+
+# ---- files made to do harm: each takes the path of a good scene (named view "a") and spoils it ---------------------
+
+
+def _swap(path: Path, name: str, make: Callable[[h5py.Group, str], Any]) -> None:
+    with h5py.File(path, "r+") as file:
+        parent, last = file[name].parent, name.rsplit("/", 1)[1]
+        del parent[last]
+        make(parent, last)
+
+
+def external_link(path: Path) -> None:
+    _swap(path, "/views/a/pose", lambda g, n: g.__setitem__(n, h5py.ExternalLink("/etc/passwd", "/x")))
+
+
+def soft_link(path: Path) -> None:
+    _swap(path, "/views/a/pose", lambda g, n: g.__setitem__(n, h5py.SoftLink("/camera/K")))
+
+
+def soft_link_to_itself(path: Path) -> None:
+    _swap(path, "/views/a", lambda g, n: g.__setitem__(n, h5py.SoftLink("/views/a")))
+
+
+def hard_link_cycle(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file["/views/a/again"] = file["/views"]
+
+
+def virtual_dataset(path: Path) -> None:
+    layout = h5py.VirtualLayout((3, 4), "<f8")
+    layout[:] = h5py.VirtualSource("/etc/passwd", "x", (3, 4))
+    _swap(path, "/views/a/pose", lambda g, n: g.create_virtual_dataset(n, layout))
+
+
+def external_storage(path: Path) -> None:
+    def make(group: h5py.Group, name: str) -> None:
+        group.create_dataset(name, (3, 4), "<f8", external=[("/etc/passwd", 0, 96)])
+
+    _swap(path, "/views/a/pose", make)
+
+
+def huge_empty_chunks(path: Path) -> None:
+    """40 TB claimed, nothing stored."""
+    _swap(path, "/views/a/spikes", lambda g, n: g.create_dataset(n, (1 << 40, 13, 3), "|u1", chunks=(1 << 10, 13, 3)))
+
+
+def huge_contiguous(path: Path) -> None:
+    """40 TB claimed in one piece that was never written."""
+    _swap(path, "/views/a/spikes", lambda g, n: g.create_dataset(n, (1 << 40, 13, 3), "|u1"))
+
+
+def deflate_bomb(path: Path) -> None:
+    """2 GB of zeros in 2 MB: within deflate's own ratio, refused by the chunk's size."""
+
+    def make(group: h5py.Group, name: str) -> None:
+        made = group.create_dataset(name, (1, 1 << 15, 1 << 16), "|u1", chunks=(1, 1 << 12, 1 << 15), compression=9)
+        made.id.write_direct_chunk((0, 0, 0), b"x")
+
+    _swap(path, "/views/a/spikes", make)
+
+
+def wrong_dtype(path: Path) -> None:
+    _swap(path, "/views/a/pose", lambda g, n: g.create_dataset(n, data=np.eye(4, dtype="<f4")[:3]))
+
+
+def text_for_numbers(path: Path) -> None:
+    _swap(path, "/views/a/pose", lambda g, n: g.create_dataset(n, data=["a", "b"], dtype=h5py.string_dtype()))
+
+
+def reference_type(path: Path) -> None:
+    _swap(path, "/views/a/pose", lambda g, n: g.create_dataset(n, (1,), h5py.ref_dtype))
+
+
+def scalar_for_array(path: Path) -> None:
+    _swap(path, "/views/a/pose", lambda g, n: g.create_dataset(n, data=1.0))
+
+
+def group_for_dataset(path: Path) -> None:
+    _swap(path, "/views/a/pose", lambda g, n: g.create_group(n))
+
+
+def unknown_filter(path: Path) -> None:
+    def make(group: h5py.Group, name: str) -> None:
+        group.create_dataset(name, data=np.eye(4)[:3], chunks=(3, 4), compression="lzf")
+
+    _swap(path, "/views/a/pose", make)
+
+
+def missing_dataset(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        del file["/views/a/pose"]
+
+
+def missing_camera(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        del file["/camera"]
+
+
+def missing_attribute(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        del file["/views/a/pixels"].attrs["start_ns"]
+
+
+def text_attribute_for_number(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file["/views/a/pixels"].attrs["start_ns"] = np.bytes_(b"soon")
+
+
+def endless_text_attribute(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file.attrs["name"] = "n" * 200_000
+
+
+def array_attribute(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file["/views/a"].attrs["order"] = np.zeros(5000, np.int64)
+
+
+def camera_of_another_size(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file["camera"].attrs["width"] = np.int64(1 << 40)
+
+
+def mirrored_pose(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file["/views/a/pose"][...] = np.diag([1, 1, -1, 1])[:3]
+
+
+def pose_of_nan(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file["/views/a/pose"][...] = np.nan
+
+
+def lost_beyond_the_end(path: Path) -> None:
+    _swap(path, "/views/v-01.x/lost", lambda g, n: g.create_dataset(n, data=np.array([[0, 1 << 60]])))
+
+
+def lost_backwards(path: Path) -> None:
+    _swap(path, "/views/v-01.x/lost", lambda g, n: g.create_dataset(n, data=np.array([[9, 3]])))
+
+
+def padding_bits(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file["/views/v-01.x/spikes"][5, 5, -1] = 0xFF
+
+
+def width_beyond_the_row(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file["/views/v-01.x/spikes"].attrs["width"] = np.int64(4000)
+
+
+def info_not_json(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file["info"][0] = 0xFF
+
+
+def info_nested_deep(path: Path) -> None:
+    text = b'{"a":' + b"[" * 200_000
+    _swap(path, "/info", lambda g, n: g.create_dataset(n, data=np.frombuffer(text, np.uint8)))
+
+
+def name_with_dots(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file["/views"].move("a", "...")
+
+
+def _raw_name(path: Path, name: bytes) -> None:
+    """Rename view "v-01.x" in the file's bytes, where HDF5 itself would refuse."""
+    with h5py.File(path, "r+", libver="earliest") as file:
+        file["/views"].move("v-01.x", "QQQQQQQQ")
+    data = path.read_bytes()
+    path.write_bytes(data.replace(b"QQQQQQQQ", name.ljust(8, b"\0")[:8]))
+
+
+def name_that_climbs(path: Path) -> None:
+    _raw_name(path, b"../../xy")
+
+
+def name_of_a_device(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file["/views"].move("a", "con\n<script>")
+
+
+def future_major(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file.attrs["version"] = np.bytes_(b"2.0")
+
+
+def version_of_nonsense(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file.attrs["version"] = np.bytes_(b"1.0; rm -rf /")
+
+
+def another_format(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file.attrs["format"] = np.bytes_(b"RS-4D")
+
+
+def not_hdf5(path: Path) -> None:
+    path.write_bytes(b"\x93NUMPY" + bytes(5000))
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def only_the_signature(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:8])
+
+
+def folder(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+def pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+# What opening and reading everything must end in (a DataError), and what `data verify` says: None means unreadable
+# (exit 4), a text means a finding with it (exit 1).
+HOSTILE: dict[Callable[[Path], None], str | None] = {
+    external_link: None,
+    soft_link: None,
+    soft_link_to_itself: None,
+    hard_link_cycle: None,
+    virtual_dataset: None,
+    external_storage: None,
+    huge_empty_chunks: None,
+    huge_contiguous: None,
+    deflate_bomb: None,
+    text_for_numbers: None,
+    reference_type: None,
+    scalar_for_array: None,
+    unknown_filter: None,
+    endless_text_attribute: None,
+    array_attribute: None,
+    name_that_climbs: None,
+    future_major: None,
+    version_of_nonsense: None,
+    another_format: None,
+    not_hdf5: None,
+    empty: None,
+    only_the_signature: None,
+    folder: None,
+    pipe: None,
+    wrong_dtype: "not what the schema says",
+    group_for_dataset: "not the f8 that belongs there",
+    missing_dataset: "pose is missing",
+    missing_camera: "camera is missing",
+    missing_attribute: "start_ns is missing",
+    text_attribute_for_number: "where int belongs",
+    camera_of_another_size: "not those that were written",
+    mirrored_pose: "not those that were written",
+    pose_of_nan: "not finite",
+    lost_beyond_the_end: "not those that were written",
+    lost_backwards: "not those that were written",
+    padding_bits: "not those that were written",
+    width_beyond_the_row: "not those that were written",
+    info_not_json: "not those that were written",
+    info_nested_deep: "not those that were written",
+    name_with_dots: "not those that were written",
+    name_of_a_device: "not those that were written",
+}
