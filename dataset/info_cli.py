@@ -47,7 +47,9 @@ def info(
     elif not raw and is_scene(file):
         found = _scene(file)
     else:
-        with opendescribe_spikes(file, **layout, drop_tail=drop_tail) as opened:  # type: ignore[arg-type]
+        from spikerig.dataset.spikes import open_spikes
+
+        with open_spikes(file, **layout, drop_tail=drop_tail) as opened:  # type: ignore[arg-type]
             found = describe_spikes(opened)
     found = {"file": str(file), **found, "bytes": file.stat().st_size}
     if as_json:
