@@ -81,7 +81,8 @@ nb::object render_forward(In means, In quats, In log_scales, In logits, In sh, I
     finite = spikerig::render_forward(f);
     for (int64_t i = 0; finite && i < f.splats.n; ++i) {
       const spikerig::Footprint &p = f.footprints.data[i];
-      radii.data()[i] = p.x0 == p.x1 ? 0.0f : p.reach_x > p.reach_y ? p.reach_x : p.reach_y;
+      const spikerig::Rect &r = f.rects.data[i];
+      radii.data()[i] = r.x0 == r.x1 ? 0.0f : p.reach_x > p.reach_y ? p.reach_x : p.reach_y;
     }
   }
   return finite ? nb::cast(out.release(), nb::rv_policy::take_ownership) : nb::none();

@@ -11,6 +11,7 @@ namespace {
 constexpr int TALL = LANES / 4;              // pixel rows of a block
 constexpr int BLOCK_ROWS = TILE / TALL;      // block rows of a tile
 constexpr int BLOCKS = 4 * BLOCK_ROWS;
+constexpr uint32_t AHEAD = 6;                 // list entries whose footprint is fetched ahead
 constexpr float NEVER = -7.994353436858858f;  // log2(ALPHA_MIN)
 
 struct Offsets {
@@ -23,22 +24,40 @@ Offsets offsets() {
   return out;
 }
 
-// Blocks that a box of this reach around (x, y), both from the tile's corner, can meet; one bit a block, row by row.
-inline uint64_t blocks_met(float x, float y, float reach_x, float reach_y) {
-  float left = x - reach_x - 0.5f, right = x + reach_x - 0.5f, top = y - reach_y - 0.5f, bottom = y + reach_y - 0.5f;
-  if (!(right >= 0 && bottom >= 0 && left <= TILE - 1 && top <= TILE - 1)) return 0;
-  int x0 = left > 0 ? static_cast<int>(left) / 4 : 0, x1 = right < TILE - 1 ? static_cast<int>(right) / 4 : 3;
-  int y0 = top > 0 ? static_cast<int>(top) / TALL : 0;
-  int y1 = bottom < TILE - 1 ? static_cast<int>(bottom) / TALL : BLOCK_ROWS - 1;
-  uint64_t columns = (2u << x1) - (1u << x0);
-  uint64_t every_row = 0x1111111111111111u;
-  every_row = (every_row >> (60 - 4 * (y1 - y0))) << 4 * y0;
-  return columns * every_row;
-}
+constexpr int ROWS = BLOCK_ROWS < 8 ? BLOCK_ROWS : LANES;  // block rows looked at together
+typedef float rows_f __attribute__((vector_size(4 * ROWS)));
+typedef int32_t rows_i __attribute__((vector_size(4 * ROWS)));
 
-inline uint64_t slot_of(const Frame &f, int splat, int tx, int ty) {
-  const Footprint &p = f.footprints.data[splat];
-  return f.first_slot.data[splat] + static_cast<int64_t>(ty - p.y0) * (p.x1 - p.x0) + (tx - p.x0);
+// Blocks that the rim alpha = ALPHA_MIN around (x, y), from the tile's corner, can meet; one bit a block, row by row.
+// For each block row: the rim's furthest right and left over that row's pixel centres, then the blocks between.
+inline uint64_t blocks_met(const Footprint &s, float x, float y) {
+  const float room = s.room * 1.0001f + 1e-4f, shrink = 1.0f / s.p, ss = s.s * s.s;
+  const float lean = s.r < 0 ? -s.r : s.r, off = y < 0 ? -y : y;
+  const float slack = 1e-3f + 1e-6f * (3 + lean * (off + TILE)) * shrink;  // above the rounding of what follows
+  const rows_f zero{}, lean_r = zero + s.lean, lean_l = zero - s.lean, last = zero + (TILE - 1);
+  uint64_t out = 0;
+  for (int first = 0; first < BLOCK_ROWS; first += ROWS) {
+    rows_f top, wide_r, wide_l;
+    rows_i place;
+    for (int j = 0; j < ROWS; ++j) top[j] = TALL * (first + j) + 0.5f, place[j] = 4 * j;
+    top -= y;
+    const rows_f bottom = top + (TALL - 1);
+    const rows_f yr = lean_r < top ? top : lean_r > bottom ? bottom : lean_r;
+    const rows_f yl = lean_l < top ? top : lean_l > bottom ? bottom : lean_l;
+    const rows_f free_r = room - ss * yr * yr, free_l = room - ss * yl * yl;
+    for (int j = 0; j < ROWS; ++j) wide_r[j] = __builtin_sqrtf(free_r[j]), wide_l[j] = __builtin_sqrtf(free_l[j]);
+    const rows_f right = (wide_r - s.r * yr) * shrink + (x - 0.5f + slack);
+    const rows_f left = (-wide_l - s.r * yl) * shrink + (x + 0.5f - slack);  // + 1: truncation rounds it up
+    const rows_i from = __builtin_convertvector(left > zero ? left : zero, rows_i) >> 2;
+    const rows_i to = __builtin_convertvector(right < last ? right : last, rows_i) >> 2;
+    rows_i columns = (((rows_i{} + 2) << to) - ((rows_i{} + 1) << from));
+    columns &= (free_r >= zero) & (right >= zero) & (left < zero + TILE) & (from <= to);
+    columns <<= place;
+    uint32_t bits = 0;
+    for (int j = 0; j < ROWS; ++j) bits |= static_cast<uint32_t>(columns[j]);
+    out |= static_cast<uint64_t>(bits) << 4 * first;
+  }
+  return out;
 }
 
 // Copies of the picture's channels for a tile, block by block; lanes outside the picture are 0.
@@ -66,19 +85,19 @@ void raster_tile(Frame &f, int tile) {
   alignas(64) vf light[BLOCKS], red[BLOCKS], green[BLOCKS], blue[BLOCKS];
   const Offsets at = offsets();
   const Corner c = corner(f, tile);
-  const int tx = tile % f.tiles_x, ty = tile / f.tiles_x;
   for (int b = 0; b < BLOCKS; ++b) light[b] = red[b] = green[b] = blue[b] = vf{};
   each_pixel(f, c, [&](int lane, int64_t) { reinterpret_cast<float *>(light)[lane] = 1.0f; });
   const vf never = splat(NEVER), least = splat(LIGHT_MIN), most = splat(ALPHA_MAX);
   uint64_t live = 0;
   for (int b = 0; b < BLOCKS; ++b) live |= static_cast<uint64_t>(any(at_least(light[b], least))) << b;
-  const int32_t *list = f.list.data;
-  const int64_t end = f.tile_start.data[tile + 1];
-  for (int64_t k = f.tile_start.data[tile]; k < end && live; ++k) {
-    if (k + 4 < end) __builtin_prefetch(&f.footprints.data[list[k + 4]]);
-    const Footprint &s = f.footprints.data[list[k]];
+  const Entry *list = f.list.data;
+  const uint32_t end = f.tile_start.data[tile + 1];
+  uint32_t k = f.tile_start.data[tile];
+  for (; k < end && live; ++k) {
+    if (k + AHEAD < end) __builtin_prefetch(&f.footprints.data[list[k + AHEAD].splat]);
+    const Footprint &s = f.footprints.data[list[k].splat];
     const float x = static_cast<float>(s.x - c.x), y = static_cast<float>(s.y - c.y);
-    uint64_t todo = blocks_met(x, y, s.reach_x, s.reach_y) & live, touched = 0;
+    uint64_t todo = blocks_met(s, x, y) & live, touched = 0;
     for (; todo; todo &= todo - 1) {
       const int b = __builtin_ctzll(todo);
       const vf dx = at.x + (4 * (b % 4) - x), dy = at.y + (TALL * (b / 4) - y);
@@ -96,8 +115,9 @@ void raster_tile(Frame &f, int tile) {
       blue[b] += w * s.blue;
       if (!any(at_least(t, least))) live &= ~(uint64_t{1} << b);
     }
-    f.touched.data[slot_of(f, list[k], tx, ty)] = touched;
+    f.touched.data[k] = touched;
   }
+  for (; k < end; ++k) f.touched.data[k] = 0;  // the tile was finished before
   each_pixel(f, c, [&](int lane, int64_t pixel) {
     float t = reinterpret_cast<float *>(light)[lane], *out = f.image + 3 * pixel;
     out[0] = reinterpret_cast<float *>(red)[lane] + t * f.background[0];
@@ -113,7 +133,6 @@ void raster_tile_back(Frame &f, int tile) {
   alignas(64) vf light[BLOCKS], behind[BLOCKS], red[BLOCKS], green[BLOCKS], blue[BLOCKS];
   const Offsets at = offsets();
   const Corner c = corner(f, tile);
-  const int tx = tile % f.tiles_x, ty = tile / f.tiles_x;
   for (int b = 0; b < BLOCKS; ++b) light[b] = behind[b] = red[b] = green[b] = blue[b] = vf{};
   each_pixel(f, c, [&](int lane, int64_t pixel) {
     const float *g = f.image_grad + 3 * pixel, *out = f.image + 3 * pixel;
@@ -124,14 +143,16 @@ void raster_tile_back(Frame &f, int tile) {
     reinterpret_cast<float *>(behind)[lane] = out[0] * g[0] + out[1] * g[1] + out[2] * g[2] - (1.0f - f.alpha[pixel]) * f.alpha_grad[pixel];
   });
   const vf never = splat(NEVER), least = splat(LIGHT_MIN), most = splat(ALPHA_MAX);
-  const int32_t *list = f.list.data;
-  const int64_t end = f.tile_start.data[tile + 1];
-  for (int64_t k = f.tile_start.data[tile]; k < end; ++k) {
-    if (k + 4 < end) __builtin_prefetch(&f.footprints.data[list[k + 4]]);
-    const uint64_t slot = slot_of(f, list[k], tx, ty);
-    uint64_t todo = f.touched.data[slot];
+  const Entry *list = f.list.data;
+  const uint32_t end = f.tile_start.data[tile + 1];
+  for (uint32_t k = f.tile_start.data[tile]; k < end; ++k) {
+    if (k + AHEAD < end && f.touched.data[k + AHEAD]) {
+      __builtin_prefetch(&f.footprints.data[list[k + AHEAD].splat]);
+      __builtin_prefetch(f.slots.data + static_cast<size_t>(list[k + AHEAD].slot) * SLOT, 1);
+    }
+    uint64_t todo = f.touched.data[k];
     if (!todo) continue;
-    const Footprint &s = f.footprints.data[list[k]];
+    const Footprint &s = f.footprints.data[list[k].splat];
     const float x = static_cast<float>(s.x - c.x), y = static_cast<float>(s.y - c.y);
     vf sum[9] = {};
     for (; todo; todo &= todo - 1) {
@@ -159,9 +180,8 @@ void raster_tile_back(Frame &f, int tile) {
       sum[4] += du * dy;
       sum[5] += dv * dy;
     }
-    float total[12];
-    sum_nine(sum, total);
-    __builtin_memcpy(f.slots.data + slot * SLOT, total, 9 * sizeof(float));
+    sum_nine(sum, f.slots.data + static_cast<size_t>(list[k].slot) * SLOT);
+    f.used.data[list[k].slot] = 1;
   }
 }
 
