@@ -110,9 +110,7 @@ def _ssim(repeats: int) -> dict[str, Any]:
     return _row("ssim", f"{WIDTH}x{HEIGHT}x3, value+gradient", run(l1_ssim), run(oracles.l1_ssim), repeats)
 
 
-def _row(
-    kernel: str, size: str, mine: Callable[[], None], oracle: Callable[[], None], repeats: int
-) -> dict[str, Any]:
+def _row(kernel: str, size: str, mine: Callable[[], None], oracle: Callable[[], None], repeats: int) -> dict[str, Any]:
     seconds, reference = _seconds(mine, repeats), _seconds(oracle, 1)
     return {
         "kernel": kernel,
