@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-from h5py import h5a, h5d, h5l, h5o, h5s, h5t  # pyright: ignore[reportAttributeAccessIssue]
+from h5py import h5a, h5d, h5g, h5l, h5o, h5s, h5t  # pyright: ignore[reportAttributeAccessIssue]
 
 from spikerig.dataset.errors import DataError, HostError, RigError, UsageError
 
@@ -34,9 +34,9 @@ RULES = 1  # raise it when the rules change: files judged by older rules are jud
 FILTERS = {1: "deflate", 2: "shuffle", 3: "fletcher32"}
 MAX_OBJECTS, MAX_DEPTH, MAX_ATTRIBUTES, MAX_TEXT = 500_000, 12, 64, 1 << 16
 MAX_CHUNK = 1 << 26
-MAX_INFLATION = 1100  # deflate's limit is 1032
+MAX_INFLATION = 32  # of a filtered dataset over 64 MiB; below that, constant images may do better
 PATIENCE_S = 15
-_MEMORY = 4 << 30
+_MEMORY = 2 << 30
 _KEPT = 4096
 _healthy: set[str] = set()
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -52,9 +52,15 @@ def refuse(path: object, cause: str) -> DataError:
     )
 
 
+def printable(text: object) -> str:
+    """A text from a file, safe to show: what could steer a terminal is escaped."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape", "backslashreplace").decode() for c in str(text))
+
+
 def spot(thing: h5py.Group | h5py.Dataset, name: str = "") -> str:
     """Where something is: the file, and the object (or a member of it) inside."""
-    return f"{thing.file.filename}: {thing.name}{'/' * bool(name)}{name}"
+    inside = f"{str(thing.name).rstrip('/')}/{name}" if name else thing.name
+    return f"{thing.file.filename}: {printable(inside)}"
 
 
 @contextmanager
@@ -144,8 +150,8 @@ def _key(s: os.stat_result) -> str:
     return hashlib.sha256(repr(facts).encode()).hexdigest()[:32]
 
 
-def member(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset:
-    """A member of a group by its plain name: a hard link to a group, or to a dataset that `check_dataset` passes."""
+def linked(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset:
+    """A member of a group by its plain name, a group or a dataset behind a hard link."""
     raw = name.encode()
     where = spot(group, name)
     if not group.id.links.exists(raw):
@@ -153,20 +159,27 @@ def member(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset:
     if group.id.links.get_info(raw).type != h5l.TYPE_HARD:
         raise refuse(where, "a soft, external or user-defined link: only hard links are followed")
     found = h5o.open(group.id, raw)
-    if isinstance(found, h5py.h5g.GroupID):
+    if isinstance(found, h5g.GroupID):
         return h5py.Group(found)
     if not isinstance(found, h5d.DatasetID):
         raise refuse(where, "neither a group nor a dataset")
-    dataset = h5py.Dataset(found)
-    check_dataset(dataset)
-    return dataset
+    return h5py.Dataset(found)
+
+
+def member(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset:
+    """As `linked`, and a dataset passes `check_dataset`."""
+    found = linked(group, name)
+    if isinstance(found, h5py.Dataset):
+        check_dataset(found)
+    return found
 
 
 def names(group: h5py.Group) -> list[str]:
-    """Names of a group's members, all of them UTF-8."""
+    """Names of a group's members: UTF-8, and plain (HDF5 would walk a name with a slash as a path)."""
     found = [str(name) for name in group]
-    if any("\udc80" <= letter <= "\udcff" for name in found for letter in name):
-        raise refuse(spot(group), "a member's name is not UTF-8")
+    for name in found:
+        if "/" in name or name in ("", ".", "..") or any("\udc80" <= letter <= "\udcff" for letter in name):
+            raise refuse(spot(group), f"a member's name is not a plain one: {printable(name)!r}")
     return found
 
 
@@ -206,7 +219,7 @@ def _check_chunks(dataset: h5py.Dataset, size: int, filtered: bool, end: int) ->
     step = math.prod(chunk) * dataset.id.get_type().get_size()
     need = math.prod(-(-n // c) for n, c in zip(shape, chunk, strict=True))
     held = dataset.id.get_storage_size()
-    if step > MAX_CHUNK or need > end or size > held * (MAX_INFLATION if filtered else 1):
+    if step > MAX_CHUNK or need > end or size > (max(MAX_CHUNK, held * MAX_INFLATION) if filtered else held):
         raise refuse(where, f"claims {size} bytes of shape {shape} in chunks of {chunk} from {held} bytes stored")
     if dataset.id.get_num_chunks() != need:
         raise refuse(where, f"{dataset.id.get_num_chunks()} of {need} chunks are there")

@@ -6,7 +6,6 @@ not contiguous and its truncated files that open "successfully" with a part miss
 
 from __future__ import annotations
 
-import os
 import zlib
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spikerig.dataset.errors import DataError, NumericsError, UsageError
+from spikerig.dataset.outfile import whole_file
 from spikerig.dataset.texture import Texture
 
 MAX_PIXELS = 1 << 28
@@ -159,6 +159,7 @@ def write_image(path: str | Path, pixels: ArrayLike, *, force: bool = False) -> 
 
     Raises:
         UsageError: the file exists, or the ending and the dtype do not fit together.
+        HostError: the disk is full, or writing is not permitted.
     """
     target = Path(path)
     array = np.asarray(pixels)
@@ -172,14 +173,8 @@ def write_image(path: str | Path, pixels: ArrayLike, *, force: bool = False) -> 
             value=f"{target.name}, {array.dtype}",
             expected=".png for uint8 or uint16 (encoded), .exr for floats (linear)",
         )
-    if target.exists() and not force:
-        raise UsageError("the picture exists already", value=target, next="give --force to replace it")
-    part = target.with_name(f".{target.stem}.{os.getpid()}.partial{target.suffix}")
-    try:
+    with whole_file(target, force=force) as part:
         (_write_png if whole else _write_exr)(part, array)
-        os.replace(part, target)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def texture_png(path: str | Path, texture: Texture, gain: float | None = None, *, force: bool = False) -> float:

@@ -145,6 +145,19 @@ def row_of(path: str | None) -> Row | None:
     return ROWS.get(re.sub(r"^(/truth)?/views/[^/]+", lambda m: (m[1] or "") + "/views/{view}", path or ""))
 
 
+def schema_markdown() -> str:
+    """The schema as a Markdown table, for docs/format.md."""
+    lines = ["| path | type | shape | what it is |", "|---|---|---|---|"]
+    for row in ROWS.values():
+        for one in (row, *row.attrs.values()):
+            name = f"`{one.path}`" if one is row else f"&emsp;`{one.path}`"
+            shape = " ".join(str(n) for n in one.shape)
+            lines.append(
+                f"| {name}{'' if one.required else ' (may be absent)'} | {one.dtype} | {shape} | {one.about} |"
+            )
+    return "\n".join(lines) + "\n"
+
+
 def read_attr(thing: h5py.Group | h5py.Dataset, name: str) -> Any:
     """An attribute of the schema as str, int or float; None where an optional one is absent.
 
@@ -312,6 +325,10 @@ def verify_scene(path: str | Path) -> list[Finding]:
     found = ask_child("verify", path)
     remember(path)  # the child walked and read it all
     return [Finding(**one) for one in found]
+
+
+if __name__ == "__main__":
+    print(schema_markdown(), end="")
 
 
 def __getattr__(name: str) -> Any:

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 from spikerig.dataset.errors import RigError
-from spikerig.dataset.hdf5_guard import hdf5_faults, walk
+from spikerig.dataset.hdf5_guard import hdf5_faults, printable, walk
 from spikerig.dataset.scene import Finding
 from spikerig.dataset.store import (
     DIGEST,
@@ -29,7 +29,7 @@ from spikerig.dataset.store import (
     stored_digest,
 )
 from spikerig.dataset.store_read import SceneFile
-from spikerig.dataset.store_write import digest
+from spikerig.dataset.store_seal import digest
 
 _TICKS = 1 << 24  # bytes of spikes looked at together
 
@@ -55,8 +55,8 @@ def verify_here(path: str) -> list[dict[str, Any]]:
 
 
 def _check(thing: h5py.Group | h5py.Dataset, sealed: bool) -> Iterator[Finding]:
-    where = str(thing.name)
-    row = row_of(where)
+    where = printable(thing.name)
+    row = row_of(thing.name)
     if row is None:
         yield Finding("schema", "suggestion", where, "not in the schema: not read", "is the file of a newer version?")
     else:
@@ -65,7 +65,7 @@ def _check(thing: h5py.Group | h5py.Dataset, sealed: bool) -> Iterator[Finding]:
     if not stored and (sealed or where == "/views"):
         yield Finding("checksum", "violation", where, "no checksum", "written by another program?")
     elif stored and stored != digest(thing):
-        what = "data" if isinstance(thing, h5py.Dataset) else "attributes or members"
+        what = "data or attributes" if isinstance(thing, h5py.Dataset) else "attributes or members"
         fix = "get the file again from its source"
         yield Finding("checksum", "critical", where, f"its {what} are not those that were written", fix)
 

@@ -7,7 +7,6 @@ record of a capture), else removes it. A kill leaves status "recording". Reading
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 from collections.abc import Iterator, Mapping
@@ -23,12 +22,11 @@ from numpy.typing import ArrayLike
 
 from spikerig.dataset.clocktime import ClockModel
 from spikerig.dataset.errors import HostError, NumericsError, UsageError
-from spikerig.dataset.hdf5_guard import MAX_TEXT, member, names, remember
+from spikerig.dataset.hdf5_guard import remember
 from spikerig.dataset.scene import Camera, Points, Scene, Trajectory, Truth, View
-from spikerig.dataset.store import DIGEST, FORMAT, NAME, VERSION, row_of, stored_digest
+from spikerig.dataset.store import FORMAT, NAME, VERSION, row_of
+from spikerig.dataset.store_seal import put_attr, seal
 from spikerig.dataset.terminal import jsonable
-
-_BLOCK = 1 << 24
 
 
 @contextmanager
@@ -75,18 +73,25 @@ class SceneWriter:
         self.part = self.path.with_name(self.path.name + ".partial")
         self.names: list[str] = []
         self._file = self._create()
-        root = self._file
-        for key, value in (("format", FORMAT), ("version", VERSION), ("status", "recording"), ("name", name)):
+        try:
+            with disk_faults(self.path):
+                self._start(self._file)
+        except BaseException:
+            self.abort()
+            raise
+
+    def _start(self, root: h5py.File) -> None:
+        marks = {"format": FORMAT, "version": VERSION, "status": "recording", "name": self.name}
+        for key, value in (marks | {"writer": f"spikerig {version('spikerig')}"}).items():
             put_attr(root, key, value)
-        put_attr(root, "writer", f"spikerig {version('spikerig')}")
         group = root.create_group("camera")
-        put_attr(group, "width", camera.width)
-        put_attr(group, "height", camera.height)
-        put(group, "K", camera.K)
-        put(group, "distortion", camera.distortion)
+        for key in ("width", "height"):
+            put_attr(group, key, getattr(self.camera, key))
+        for key in ("K", "distortion"):
+            put(group, key, getattr(self.camera, key))
         self._views = root.create_group("views")
-        if truth is not None:
-            self._put_truth(truth)
+        if self.truth is not None:
+            self._put_truth(self.truth)
         root.flush()
 
     def _create(self) -> h5py.File:
@@ -232,7 +237,12 @@ class SceneWriter:
             return
         try:
             put_attr(self._file, "status", "aborted")
+        except (OSError, RuntimeError, ValueError):
+            pass  # the disk is full or gone: the part stays "recording", which is as clear
+        try:
             self._file.close()
+        except (OSError, RuntimeError):
+            pass
         finally:
             if not (keep and self.names):
                 self.part.unlink(missing_ok=True)
@@ -273,25 +283,6 @@ def put(parent: h5py.Group, name: str, values: ArrayLike) -> h5py.Dataset:
     return parent.create_dataset(name, data=np.ascontiguousarray(values, np.dtype("<" + row.dtype)))
 
 
-def put_attr(thing: h5py.Group | h5py.Dataset, name: str, value: str | float | None) -> None:
-    """Store an attribute by its kind in the schema; None leaves it out."""
-    row = row_of(thing.name)
-    kind = "text" if name == DIGEST else row.attrs[name].dtype if row else "text"
-    if value is None:
-        return
-    if kind == "text":
-        raw = str(value).encode()
-        if len(raw) > MAX_TEXT or b"\0" in raw:
-            raise UsageError("a text too long, or with a NUL, for an attribute", value=f"{thing.name}@{name}")
-        stored: Any = np.array(raw, h5py.string_dtype("utf-8", max(len(raw), 1)))
-    else:
-        try:
-            stored = np.int64(value) if kind == "int" else np.float64(value)
-        except OverflowError as error:
-            raise UsageError("a number beyond 64 bits", value=f"{thing.name}@{name} = {value}") from error
-    thing.attrs[name] = stored
-
-
 def put_json(parent: h5py.Group, name: str, record: Mapping[str, Any]) -> None:
     """Store a JSON object as its bytes."""
     text = json.dumps(jsonable(dict(record)), allow_nan=False, ensure_ascii=False)
@@ -311,38 +302,6 @@ def _put_trajectory(parent: h5py.Group, path: Trajectory) -> None:
     put(group, "poses", path.poses)
     if path.cov is not None:
         put(group, "cov", path.cov)
-
-
-def digest(thing: h5py.Group | h5py.Dataset) -> str:
-    """SHA-256 (hex) of an object: its attributes by name, then a dataset's type, shape and bytes or a group's members.
-
-    Edges:
-        The attribute `sha256` itself is left out; a group's members enter by name and by their stored digests.
-    """
-    total = hashlib.sha256()
-    for name in sorted(set(thing.attrs) - {DIGEST}):
-        value: Any = thing.attrs[name]
-        plain = value.decode() if isinstance(value, bytes) else value.hex() if hasattr(value, "hex") else int(value)
-        total.update(f"@{name}={plain}\0".encode())
-    if isinstance(thing, h5py.Group):
-        for name in sorted(thing):
-            total.update(f"{name}:{stored_digest(member(thing, name))}\0".encode())
-        return total.hexdigest()
-    total.update(f"{thing.dtype.str}{thing.shape}\0".encode())
-    rows = max(1, _BLOCK // max(1, thing.nbytes // max(1, thing.shape[0])))
-    for k in range(0, thing.shape[0] if thing.size else 0, rows):
-        total.update(np.ascontiguousarray(thing[k : k + rows]).data)
-    return total.hexdigest()
-
-
-def seal(thing: h5py.Group | h5py.Dataset) -> None:
-    """Give an object, and everything below it that has none, its digest; members first."""
-    if isinstance(thing, h5py.Group):
-        for name in names(thing):
-            below = member(thing, name)
-            if not stored_digest(below):
-                seal(below)
-    put_attr(thing, DIGEST, digest(thing))
 
 
 def _sync(path: Path) -> None:

@@ -1,6 +1,7 @@
 """Hard inputs of the scene file and the pictures: a scene with everything in it, and files made to do harm."""
 
 import os
+import zlib
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -61,7 +62,7 @@ def full_scene() -> Scene:
     truth = Truth(
         {name: rng.standard_normal((H, W, 3)).astype(np.float32) for name in ("a", "Z9")},
         {"a": 2**60 + 1, "_b": -3},
-        {"a": path(9, cov=False)},
+        {"a": path(9, cov=True)},
         clock,
         {"shot": {"threshold_e": 560.25}, "list": [1, None, True, "ü"]},
         2**62,
@@ -144,11 +145,13 @@ def huge_contiguous(path: Path) -> None:
 
 
 def deflate_bomb(path: Path) -> None:
-    """2 GB of zeros in 2 MB: within deflate's own ratio, refused by the chunk's size."""
+    """2 GB of zeros in 2 MB, every chunk honestly there."""
+    zeros = zlib.compress(bytes(1 << 24), 9)
 
     def make(group: h5py.Group, name: str) -> None:
-        made = group.create_dataset(name, (1, 1 << 15, 1 << 16), "|u1", chunks=(1, 1 << 12, 1 << 15), compression=9)
-        made.id.write_direct_chunk((0, 0, 0), b"x")
+        made = group.create_dataset(name, (1, 1 << 19, 1 << 12), "|u1", chunks=(1, 1 << 12, 1 << 12), compression=9)
+        for k in range(0, 1 << 19, 1 << 12):
+            made.id.write_direct_chunk((0, k, 0), zeros)
 
     _swap(path, "/views/a/spikes", make)
 
@@ -258,16 +261,23 @@ def name_with_dots(path: Path) -> None:
         file["/views"].move("a", "...")
 
 
-def _raw_name(path: Path, name: bytes) -> None:
-    """Rename view "v-01.x" in the file's bytes, where HDF5 itself would refuse."""
-    with h5py.File(path, "r+", libver="earliest") as file:
-        file["/views"].move("v-01.x", "QQQQQQQQ")
-    data = path.read_bytes()
-    path.write_bytes(data.replace(b"QQQQQQQQ", name.ljust(8, b"\0")[:8]))
-
-
 def name_that_climbs(path: Path) -> None:
-    _raw_name(path, b"../../xy")
+    """A member called "../../xy": HDF5 refuses to make it, so it is patched into a file without checksums."""
+    with h5py.File(path) as good, h5py.File(path.with_suffix(".old"), "w", libver="earliest") as old:
+        old.create_group("views")  # of the old kind: its members' names lie in a plain heap
+        for name in [*(n for n in good if n != "views"), *(f"views/{n}" for n in good["views"])]:
+            good.copy(name, old, name)
+        for name in good.attrs:
+            old.attrs[name] = good.attrs[name]
+        old["views"].move("v-01.x", "QQQQQQQQ")
+    data = path.with_suffix(".old").read_bytes()
+    assert data.count(b"QQQQQQQQ") == 1
+    path.write_bytes(data.replace(b"QQQQQQQQ", b"../../xy"))
+
+
+def name_of_the_parent(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file["/views"].move("a", "..")
 
 
 def name_of_a_device(path: Path) -> None:
@@ -331,6 +341,7 @@ HOSTILE: dict[Callable[[Path], None], str | None] = {
     endless_text_attribute: None,
     array_attribute: None,
     name_that_climbs: None,
+    name_of_the_parent: None,
     future_major: None,
     version_of_nonsense: None,
     another_format: None,

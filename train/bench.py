@@ -105,7 +105,7 @@ def _ssim(repeats: int) -> dict[str, Any]:
     image.requires_grad_()
 
     def run(loss: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]) -> Callable[[], None]:
-        return lambda: [None for _ in torch.autograd.grad(loss(image, target), image)][0]
+        return lambda: next(None for _ in torch.autograd.grad(loss(image, target), image))
 
     return _row("ssim", f"{WIDTH}x{HEIGHT}x3, value+gradient", run(l1_ssim), run(oracles.l1_ssim), repeats)
 
