@@ -125,6 +125,8 @@ bool render_forward(Frame &f) {
     if (!fit.data[part]) return false;
   bin(f, sort_by_depth(f));
   f.touched.need(f.pairs);
+  const size_t lanes = static_cast<size_t>(f.tiles_x) * f.tiles_y * TILE * TILE;
+  f.light.need(lanes), f.finished.need(lanes);
   parallel(f.tiles_x * f.tiles_y, [&](int tile) { kernel.raster_tile(f, tile); });
   return true;
 }

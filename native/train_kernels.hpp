@@ -110,6 +110,8 @@ struct Frame {  // one picture on its way
   Buffer<uint32_t> cursor;         // [tiles]
   Buffer<Entry> list;              // [pairs] by tile, front to back
   Buffer<uint64_t> touched;        // [pairs] by place in `list`: blocks of the tile where the splat left light
+  Buffer<float> light;             // [tiles, TILE * TILE] left at the end, in the kernel's order of a tile's pixels
+  Buffer<int32_t> finished;        // same: place in the tile's list where the pixel was finished
   Buffer<float> slots;             // [pairs, SLOT]
   Buffer<uint8_t> used;            // [pairs] 1 where the slot holds anything
   Buffer<double> camera_part;    // [chunks, 15]

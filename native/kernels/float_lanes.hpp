@@ -40,13 +40,19 @@ inline void store(float *p, vf x) { __builtin_memcpy(p, &x, sizeof x); }
 #if defined(SPIKERIG_LANES) && SPIKERIG_LANES == 16
 using mask = __mmask16;
 inline mask at_least(vf a, vf b) { return _mm512_cmp_ps_mask(a, b, _CMP_GE_OQ); }
+inline mask at_least(vi a, vi b) { return _mm512_cmp_epi32_mask((__m512i)a, (__m512i)b, _MM_CMPINT_NLT); }
 inline mask both(mask a, mask b) { return static_cast<mask>(a & b); }
+inline mask without(mask a, mask b) { return static_cast<mask>(a & ~b); }
+inline vi choose(mask m, vi a, vi b) { return (vi)_mm512_mask_mov_epi32((__m512i)b, m, (__m512i)a); }
 inline bool any(mask m) { return m != 0; }
 inline vf keep(mask m, vf x) { return _mm512_maskz_mov_ps(m, x); }
 #else
 using mask = vi;
 inline mask at_least(vf a, vf b) { return a >= b; }
+inline mask at_least(vi a, vi b) { return a >= b; }
 inline mask both(mask a, mask b) { return a & b; }
+inline mask without(mask a, mask b) { return a & ~b; }
+inline vi choose(mask m, vi a, vi b) { return (m & a) | (~m & b); }
 inline vf keep(mask m, vf x) { return (vf)(m & (vi)x); }
 #if defined(SPIKERIG_LANES)
 inline bool any(mask m) { return _mm256_movemask_ps((__m256)m) != 0; }

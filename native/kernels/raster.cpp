@@ -11,7 +11,7 @@ namespace {
 constexpr int TALL = LANES / 4;              // pixel rows of a block
 constexpr int BLOCK_ROWS = TILE / TALL;      // block rows of a tile
 constexpr int BLOCKS = 4 * BLOCK_ROWS;
-constexpr uint32_t AHEAD = 6;                 // list entries whose footprint is fetched ahead
+constexpr int AHEAD = 6;                      // list entries whose footprint is fetched ahead
 constexpr float NEVER = -7.994353436858858f;  // log2(ALPHA_MIN)
 
 struct Offsets {
@@ -83,41 +83,49 @@ inline void each_pixel(const Frame &f, const Corner &c, Visit visit) {  // visit
 
 void raster_tile(Frame &f, int tile) {
   alignas(64) vf light[BLOCKS], red[BLOCKS], green[BLOCKS], blue[BLOCKS];
+  alignas(64) vi finished[BLOCKS];
   const Offsets at = offsets();
   const Corner c = corner(f, tile);
-  for (int b = 0; b < BLOCKS; ++b) light[b] = red[b] = green[b] = blue[b] = vf{};
+  for (int b = 0; b < BLOCKS; ++b) light[b] = red[b] = green[b] = blue[b] = vf{}, finished[b] = vi{} + INT32_MAX;
   each_pixel(f, c, [&](int lane, int64_t) { reinterpret_cast<float *>(light)[lane] = 1.0f; });
   const vf never = splat(NEVER), least = splat(LIGHT_MIN), most = splat(ALPHA_MAX);
   uint64_t live = 0;
   for (int b = 0; b < BLOCKS; ++b) live |= static_cast<uint64_t>(any(at_least(light[b], least))) << b;
-  const Entry *list = f.list.data;
-  const uint32_t end = f.tile_start.data[tile + 1];
-  uint32_t k = f.tile_start.data[tile];
-  for (; k < end && live; ++k) {
-    if (k + AHEAD < end) __builtin_prefetch(&f.footprints.data[list[k + AHEAD].splat]);
+  const Entry *list = f.list.data + f.tile_start.data[tile];
+  uint64_t *touched = f.touched.data + f.tile_start.data[tile];
+  const int count = static_cast<int>(f.tile_start.data[tile + 1] - f.tile_start.data[tile]);
+  int k = 0;
+  for (; k < count && live; ++k) {
+    if (k + AHEAD < count) __builtin_prefetch(&f.footprints.data[list[k + AHEAD].splat]);
     const Footprint &s = f.footprints.data[list[k].splat];
     const float x = static_cast<float>(s.x - c.x), y = static_cast<float>(s.y - c.y);
-    uint64_t todo = blocks_met(s, x, y) & live, touched = 0;
+    uint64_t todo = blocks_met(s, x, y) & live, met = 0;
     for (; todo; todo &= todo - 1) {
       const int b = __builtin_ctzll(todo);
       const vf dx = at.x + (4 * (b % 4) - x), dy = at.y + (TALL * (b / 4) - y);
       const vf u = s.p * dx + s.r * dy, v = s.s * dy;
       const vf power = s.log2_opacity - v * v - u * u;
-      vf t = light[b];
-      const mask on = both(at_least(power, never), at_least(t, least));
+      const vf before = light[b];
+      const mask on = both(at_least(power, never), at_least(before, least));
       if (!any(on)) continue;
-      touched |= uint64_t{1} << b;
-      const vf w = keep(on, smaller(exp2_lanes(power), most)) * t;
-      t -= w;
-      light[b] = t;
+      met |= uint64_t{1} << b;
+      const vf alpha = keep(on, smaller(exp2_lanes(power), most)), w = alpha * before;
+      const vf after = before * (1.0f - alpha);
+      light[b] = after;
       red[b] += w * s.red;
       green[b] += w * s.green;
       blue[b] += w * s.blue;
-      if (!any(at_least(t, least))) live &= ~(uint64_t{1} << b);
+      const mask still = at_least(after, least), now = without(on, still);
+      if (!any(now)) continue;
+      finished[b] = choose(now, vi{} + k, finished[b]);
+      if (!any(still)) live &= ~(uint64_t{1} << b);
     }
-    f.touched.data[k] = touched;
+    touched[k] = met;
   }
-  for (; k < end; ++k) f.touched.data[k] = 0;  // the tile was finished before
+  for (; k < count; ++k) touched[k] = 0;  // the tile was finished before
+  const size_t lanes = static_cast<size_t>(tile) * TILE * TILE;
+  __builtin_memcpy(f.light.data + lanes, light, sizeof light);
+  __builtin_memcpy(f.finished.data + lanes, finished, sizeof finished);
   each_pixel(f, c, [&](int lane, int64_t pixel) {
     float t = reinterpret_cast<float *>(light)[lane], *out = f.image + 3 * pixel;
     out[0] = reinterpret_cast<float *>(red)[lane] + t * f.background[0];
@@ -127,30 +135,35 @@ void raster_tile(Frame &f, int tile) {
   });
 }
 
-// Front to back again, with the light T recomputed and what lies behind kept as one number a pixel: S starts at
-// <picture, gradient> and loses each splat's share, so d(loss)/d(alpha) = T <colour, gradient> - S / (1 - alpha).
+// Back to front: the light T is undone by 1 / (1 - alpha) >= 1, which is at most 100, and S, the loss's share of all
+// that lies behind, grows from small to large. So both keep their relative accuracy however deep the stack.
+// d(loss)/d(alpha) = T <colour, gradient> - S / (1 - alpha).
 void raster_tile_back(Frame &f, int tile) {
   alignas(64) vf light[BLOCKS], behind[BLOCKS], red[BLOCKS], green[BLOCKS], blue[BLOCKS];
+  alignas(64) vi finished[BLOCKS];
   const Offsets at = offsets();
   const Corner c = corner(f, tile);
-  for (int b = 0; b < BLOCKS; ++b) light[b] = behind[b] = red[b] = green[b] = blue[b] = vf{};
+  const size_t lanes = static_cast<size_t>(tile) * TILE * TILE;
+  __builtin_memcpy(light, f.light.data + lanes, sizeof light);
+  __builtin_memcpy(finished, f.finished.data + lanes, sizeof finished);
+  for (int b = 0; b < BLOCKS; ++b) behind[b] = red[b] = green[b] = blue[b] = vf{};
   each_pixel(f, c, [&](int lane, int64_t pixel) {
-    const float *g = f.image_grad + 3 * pixel, *out = f.image + 3 * pixel;
-    reinterpret_cast<float *>(light)[lane] = 1.0f;
+    const float *g = f.image_grad + 3 * pixel, *end = f.background;
     reinterpret_cast<float *>(red)[lane] = g[0];
     reinterpret_cast<float *>(green)[lane] = g[1];
     reinterpret_cast<float *>(blue)[lane] = g[2];
-    reinterpret_cast<float *>(behind)[lane] = out[0] * g[0] + out[1] * g[1] + out[2] * g[2] - (1.0f - f.alpha[pixel]) * f.alpha_grad[pixel];
+    reinterpret_cast<float *>(behind)[lane] =
+        reinterpret_cast<float *>(light)[lane] * (g[0] * end[0] + g[1] * end[1] + g[2] * end[2] - f.alpha_grad[pixel]);
   });
-  const vf never = splat(NEVER), least = splat(LIGHT_MIN), most = splat(ALPHA_MAX);
-  const Entry *list = f.list.data;
-  const uint32_t end = f.tile_start.data[tile + 1];
-  for (uint32_t k = f.tile_start.data[tile]; k < end; ++k) {
-    if (k + AHEAD < end && f.touched.data[k + AHEAD]) {
-      __builtin_prefetch(&f.footprints.data[list[k + AHEAD].splat]);
-      __builtin_prefetch(f.slots.data + static_cast<size_t>(list[k + AHEAD].slot) * SLOT, 1);
+  const vf never = splat(NEVER), most = splat(ALPHA_MAX);
+  const Entry *list = f.list.data + f.tile_start.data[tile];
+  const uint64_t *touched = f.touched.data + f.tile_start.data[tile];
+  for (int k = static_cast<int>(f.tile_start.data[tile + 1] - f.tile_start.data[tile]) - 1; k >= 0; --k) {
+    if (k >= AHEAD && touched[k - AHEAD]) {
+      __builtin_prefetch(&f.footprints.data[list[k - AHEAD].splat]);
+      __builtin_prefetch(f.slots.data + static_cast<size_t>(list[k - AHEAD].slot) * SLOT, 1);
     }
-    uint64_t todo = f.touched.data[k];
+    uint64_t todo = touched[k];
     if (!todo) continue;
     const Footprint &s = f.footprints.data[list[k].splat];
     const float x = static_cast<float>(s.x - c.x), y = static_cast<float>(s.y - c.y);
@@ -160,18 +173,17 @@ void raster_tile_back(Frame &f, int tile) {
       const vf dx = at.x + (4 * (b % 4) - x), dy = at.y + (TALL * (b / 4) - y);
       const vf u = s.p * dx + s.r * dy, v = s.s * dy;
       const vf power = s.log2_opacity - v * v - u * u;
-      const vf t = light[b];
-      const mask on = both(at_least(power, never), at_least(t, least));
+      const mask on = both(at_least(power, never), at_least(finished[b], vi{} + k));
       const vf free = exp2_lanes(power);
-      const vf alpha = keep(on, smaller(free, most)), w = alpha * t;
+      const vf alpha = keep(on, smaller(free, most)), undo = 1.0f / (1.0f - alpha);
+      const vf t = light[b] * undo, w = alpha * t, rest = behind[b];
       const vf shade = s.red * red[b] + s.green * green[b] + s.blue * blue[b];
-      const vf rest = behind[b] - w * shade;
-      light[b] = t - w;
-      behind[b] = rest;
+      light[b] = t;
+      behind[b] = rest + w * shade;
       sum[6] += w * red[b];
       sum[7] += w * green[b];
       sum[8] += w * blue[b];
-      const vf d = keep(at_least(most, free), alpha * (t * shade - rest / (1.0f - alpha)));  // d loss / d log alpha
+      const vf d = keep(at_least(most, free), alpha * (t * shade - rest * undo));  // d loss / d log alpha
       const vf du = d * u, dv = d * dy;
       sum[0] += d;
       sum[1] += du;
