@@ -33,7 +33,7 @@ class H5Writer:
 
     def __init__(self, path: Path, like: SpikeStream | SpikeFile) -> None:
         row = (like.width + 7) // 8
-        self.file = h5py.File(path, "w", libver=("v110", "v110"))
+        self.file = h5py.File(path, "w", libver=("v110", "v110"), rdcc_nbytes=16 << 20)
         self.file.attrs.update({k: np.bytes_(v) for k, v in _head("recording").items()})
         self.group = group = self.file.create_group("spikes")
         group.attrs["width"] = np.int64(like.width)
