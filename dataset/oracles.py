@@ -43,11 +43,12 @@ def tfi_at(
 
 def tfi_all(bits: Bits, width: int) -> NDArray[np.uint16]:
     """The enclosing interval at every tick: uint16[T,H,W], 0 where not known, 65535 and more as 65535."""
-    out = np.zeros((*bits.shape[:2], width), np.uint16)
-    for tick in range(len(bits)):
-        a, b = tfi_at(bits, width, tick)
-        out[tick] = np.where((a < 0) | (b < 0), 0, np.minimum(b - a, 65535))
-    return out
+    spikes, ticks = unpack(bits, width) != 0, len(bits)
+    now = np.arange(ticks)[:, None, None]
+    last = np.maximum.accumulate(np.where(spikes, now, -1), axis=0)
+    before = np.concatenate([np.full_like(last[:1], -1), last])[:ticks]  # last spike < t
+    after = np.minimum.accumulate(np.where(spikes, now, ticks)[::-1], axis=0)[::-1]  # first spike >= t
+    return np.where((before < 0) | (after == ticks), 0, np.minimum(after - before, 65535)).astype(np.uint16)
 
 
 def fixed_light(light: NDArray[np.float32], knots: NDArray[np.int64], *, hold: bool) -> NDArray[np.int64]:

@@ -35,6 +35,33 @@ def write_npz(path: Path, stream: SpikeStream) -> None:
         )  # fmt: skip
 
 
+class Cursor:
+    """Reads an array's data at rising offsets without starting over; going back starts over."""
+
+    def __init__(self, archive: zipfile.ZipFile, name: str) -> None:
+        self.archive, self.name = archive, name
+        self.file: IO[bytes] | None = None
+        self.at = 0
+
+    def take(self, start: int, n: int) -> bytes:
+        """`n` bytes of data from byte `start`; EOFError where there are fewer."""
+        if self.file is None or start < self.at:
+            self.close()
+            self.file, self.at = self.archive.open(self.name), 0
+            _past_header(self.file)
+        while self.at < start:
+            self.at += len(_exactly(self.file, min(start - self.at, _PIECE)))
+        data = _exactly(self.file, n)
+        self.at += n
+        return data
+
+    def close(self) -> None:
+        """Forget the place."""
+        if self.file is not None:
+            self.file.close()
+        self.file = None
+
+
 class Member(NamedTuple):
     """An array of an archive, as its header says."""
 
@@ -90,9 +117,7 @@ def open_npz(path: Path, axes: str | None = None) -> SpikeFile:
 
 def _header(archive: zipfile.ZipFile, name: str) -> Member:
     with archive.open(name) as file:
-        version = np.lib.format.read_magic(file)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, fortran, dtype = read(file)
+        shape, fortran, dtype = _past_header(file)
         held = archive.getinfo(name).file_size - file.tell()
     if not dtype.hasobject and math.prod(shape) * dtype.itemsize != held:
         raise ValueError(f"{name} claims {shape} of {dtype} and holds {held} bytes")
@@ -123,11 +148,12 @@ def _open_ours(path: Path, archive: zipfile.ZipFile, members: list[Member], axes
     except (*_FAULTS, KeyError, TypeError) as error:
         raise _damaged(path, error) from error
 
+    cursor = Cursor(archive, bits.name)
+
     def decode(t0: int, t1: int) -> Bits:
         try:
-            with archive.open(bits.name) as file:
-                _skip(file, t0 * height * row)
-                out = np.frombuffer(_take(file, (t1 - t0) * height * row), np.uint8).reshape(-1, height, row)
+            data = cursor.take(t0 * height * row, (t1 - t0) * height * row)
+            out = np.frombuffer(data, np.uint8).reshape(-1, height, row)
             if width % 8 and np.any(out[:, :, -1] >> (width % 8)):
                 raise ValueError("padding bits are set")
             return out
@@ -145,13 +171,14 @@ def _open_foreign(path: Path, archive: zipfile.ZipFile, array: Member, axes: str
         raise DataError("the archive holds no pixels", value=f"{path}: {array.shape}")
     stored = axes[::-1] if array.fortran else axes
     whole: list[Bits] = []
+    cursor = Cursor(archive, array.name)
 
     def decode(t0: int, t1: int) -> Bits:
         try:
             if stored == "THW":
-                return _read_ticks(archive, array, (height, width), t0, t1)
+                return _read_ticks(cursor, array, (height, width), t0, t1)
             if not whole:
-                whole.append(_read_whole(archive, array, stored, (ticks, height, width)))
+                whole.append(_read_whole(cursor, array, stored, (ticks, height, width)))
             return whole[0][t0:t1]
         except (*_FAULTS, MemoryError) as error:
             raise _damaged(path, error) from error
@@ -160,53 +187,51 @@ def _open_foreign(path: Path, archive: zipfile.ZipFile, array: Member, axes: str
     return SpikeFile(path, "npz", ticks, height, width, decode, archive.close, facts=facts)
 
 
-def _read_ticks(archive: zipfile.ZipFile, array: Member, picture: tuple[int, int], t0: int, t1: int) -> Bits:
+def _read_ticks(cursor: Cursor, array: Member, picture: tuple[int, int], t0: int, t1: int) -> Bits:
     height, width = picture
-    step = max(1, _PIECE // (height * width * array.dtype.itemsize))
+    tick = height * width * array.dtype.itemsize
+    step = max(1, _PIECE // tick)
     out = np.empty((t1 - t0, height, (width + 7) // 8), np.uint8)
-    with archive.open(array.name) as file:
-        _skip(file, t0 * height * width * array.dtype.itemsize)
-        for first in range(0, t1 - t0, step):
-            n = min(step, t1 - t0 - first)
-            out[first : first + n] = np.packbits(_ones(file, array, (n, height, width)), axis=2, bitorder="little")
+    for first in range(t0, t1, step):
+        n = min(step, t1 - first)
+        pixels = _ones(cursor.take(first * tick, n * tick), array, (n, height, width))
+        out[first - t0 : first - t0 + n] = np.packbits(pixels, axis=2, bitorder="little")
     return out
 
 
-def _read_whole(archive: zipfile.ZipFile, array: Member, stored: str, shape: tuple[int, int, int]) -> Bits:
+def _read_whole(cursor: Cursor, array: Member, stored: str, shape: tuple[int, int, int]) -> Bits:
     """Any other order of axes, slab by slab along the first one in the file."""
     size = dict(zip("THW", shape, strict=True))
     slab = (size[stored[1]], size[stored[2]])
+    step = math.prod(slab) * array.dtype.itemsize
     out = np.empty((shape[0], shape[1], (shape[2] + 7) // 8), np.uint8)
-    with archive.open(array.name) as file:
-        _skip(file, 0)
-        for i in range(0, size[stored[0]], 8 if stored[0] == "W" else 1):
-            if stored == "WHT":  # a byte's bits lie in eight slabs
-                eight = np.stack([_ones(file, array, slab) for _ in range(min(8, shape[2] - i))])
-                out[:, :, i // 8] = np.packbits(eight, axis=0, bitorder="little")[0].T
-            elif stored == "HWT":
-                out[:, i] = np.packbits(_ones(file, array, slab).T, axis=1, bitorder="little")
-            else:  # TWH
-                out[i] = np.packbits(_ones(file, array, slab).T, axis=1, bitorder="little")
+    for i in range(0, size[stored[0]], 8 if stored[0] == "W" else 1):
+        if stored == "WHT":  # a byte's bits lie in eight slabs
+            n = min(8, shape[2] - i)
+            eight = _ones(cursor.take(i * step, n * step), array, (n, *slab))
+            out[:, :, i // 8] = np.packbits(eight, axis=0, bitorder="little")[0].T
+        elif stored == "HWT":
+            out[:, i] = np.packbits(_ones(cursor.take(i * step, step), array, slab).T, axis=1, bitorder="little")
+        else:  # TWH
+            out[i] = np.packbits(_ones(cursor.take(i * step, step), array, slab).T, axis=1, bitorder="little")
     return out
 
 
-def _skip(file: IO[bytes], data: int) -> None:
-    """Go past an array's header and the first `data` bytes of its data."""
+def _past_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
     version = np.lib.format.read_magic(file)
-    (np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0)(file)
-    while data > 0:
-        data -= len(_take(file, min(data, _PIECE)))
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    return read(file)
 
 
-def _take(file: IO[bytes], n: int) -> bytes:
+def _exactly(file: IO[bytes], n: int) -> bytes:
     data = file.read(n)
     if len(data) != n:
         raise EOFError(f"{len(data)} of {n} bytes")
     return data
 
 
-def _ones(file: IO[bytes], array: Member, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    values = np.frombuffer(_take(file, math.prod(shape) * array.dtype.itemsize), array.dtype)
+def _ones(data: bytes, array: Member, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    values = np.frombuffer(data, array.dtype)
     ones = values != 0
     if not np.all(values[ones] == 1):
         odd = values[ones][values[ones] != 1][0]

@@ -81,13 +81,14 @@ nb::object render_forward(In means, In quats, In log_scales, In logits, In sh, I
     finite = spikerig::render_forward(f);
     for (int64_t i = 0; finite && i < f.splats.n; ++i) {
       const spikerig::Footprint &p = f.footprints.data[i];
-      radii.data()[i] = p.x0 == p.x1 ? 0.0f : p.reach_x > p.reach_y ? p.reach_x : p.reach_y;
+      const spikerig::Rect &r = f.rects.data[i];
+      radii.data()[i] = r.x0 == r.x1 ? 0.0f : p.reach_x > p.reach_y ? p.reach_x : p.reach_y;
     }
   }
   return finite ? nb::cast(out.release(), nb::rv_policy::take_ownership) : nb::none();
 }
 
-void render_backward(Render &render, In means, In quats, In log_scales, In logits, In sh, Out image, Out alpha,
+void render_backward(Render &render, In means, In quats, In log_scales, In logits, In sh,
                      In image_grad, In alpha_grad, Out g_means, Out g_quats, Out g_log_scales, Out g_logits, Out g_sh,
                      Out g_means2d, OutDouble g_camera) {
   spikerig::Frame &f = *render.frame;
@@ -96,11 +97,7 @@ void render_backward(Render &render, In means, In quats, In log_scales, In logit
   expect(size_t(f.splats.n) == n && g_means.size() == 3 * n && g_quats.size() == 4 * n && g_log_scales.size() == 3 * n &&
              g_logits.size() == n && g_sh.size() == sh.size() && g_means2d.size() == 2 * n && g_camera.size() == 12,
          "gradients");
-  expect(image.size() == 3 * pixels && alpha.size() == pixels && image_grad.size() == 3 * pixels &&
-             alpha_grad.size() == pixels,
-         "pictures");
-  f.image = image.data();
-  f.alpha = alpha.data();
+  expect(image_grad.size() == 3 * pixels && alpha_grad.size() == pixels, "pictures");
   f.image_grad = image_grad.data();
   f.alpha_grad = alpha_grad.data();
   nb::gil_scoped_release release;
@@ -135,6 +132,8 @@ double l1_ssim(In image, In target, nb::object valid, nb::object grad, double l1
 void bind_train(nb::module_ &m) {
   nb::set_leak_warnings(false);  // a graph alive at exit keeps its Render; that is no leak
   nb::class_<Render>(m, "Render", "One picture's lists and footprints, kept from forward to backward.")
+      .def_prop_ro("width", [](const Render &r) { return r.frame->camera.width; }, "Pixels.")
+      .def_prop_ro("height", [](const Render &r) { return r.frame->camera.height; }, "Pixels.")
       .def_prop_ro("pairs", [](const Render &r) { return r.frame->pairs; }, "(tile, splat) pairs.")
       .def_prop_ro("visible", [](const Render &r) { return r.frame->visible; }, "Splats not culled.")
       .def("consulted", [](const Render &r) { return spikerig::consulted(*r.frame); },
@@ -143,7 +142,7 @@ void bind_train(nb::module_ &m) {
         "width"_a, "height"_a, "sh_degree"_a, "antialias"_a, "image"_a, "alpha"_a, "radii"_a,
         "camera: fx fy cx cy, cam_from_world[12], near, background[3]. None when a parameter is not finite.");
   m.def("render_backward", &render_backward, "render"_a, "means"_a, "quats"_a, "log_scales"_a, "logits"_a, "sh"_a,
-        "image"_a, "alpha"_a, "image_grad"_a, "alpha_grad"_a, "g_means"_a, "g_quats"_a, "g_log_scales"_a, "g_logits"_a,
+        "image_grad"_a, "alpha_grad"_a, "g_means"_a, "g_quats"_a, "g_log_scales"_a, "g_logits"_a,
         "g_sh"_a, "g_means2d"_a, "g_camera"_a, "Gradients of the picture render_forward drew.");
   m.def("l1_ssim", &l1_ssim, "image"_a, "target"_a, "valid"_a.none(), "grad"_a.none(), "l1_scale"_a, "ssim_scale"_a,
         "l1_scale * sum |image - target| + ssim_scale * sum (1 - ssim) over valid channels; grad is written.");

@@ -34,10 +34,9 @@ const uint32_t *sort_by_depth(Frame &f) {
   static thread_local uint32_t histogram[3][2048];
   std::memset(histogram, 0, sizeof histogram);
   for (int64_t i = 0; i < n; ++i) {
-    const Footprint &p = f.footprints.data[i];
-    if (p.x0 == p.x1) continue;
+    if (f.rects.data[i].x0 == f.rects.data[i].x1) continue;
     uint32_t bits;
-    std::memcpy(&bits, &p.depth, 4);  // positive, so its bits sort as it does
+    std::memcpy(&bits, &f.depths.data[i], 4);  // positive, so its bits sort as it does
     key[count] = bits;
     id[count++] = static_cast<uint32_t>(i);
     ++histogram[0][bits & 2047], ++histogram[1][bits >> 11 & 2047], ++histogram[2][bits >> 22];
@@ -59,44 +58,52 @@ const uint32_t *sort_by_depth(Frame &f) {
   return id;
 }
 
-struct Rect {
-  uint16_t x0, x1, y0, y1;
-};
-
-// Lists of splats by tile, front to back. Bands of tile rows are independent of each other.
-void bin(Frame &f, const uint32_t *sorted) {
-  const int tiles = f.tiles_x * f.tiles_y, band_rows = 4, bands = (f.tiles_y + band_rows - 1) / band_rows;
-  f.first_slot.need(f.splats.n), f.rects.need(f.visible);
-  f.pairs = 0;
+// How many splats each tile has: corners of the rectangles, then sums along x and along y.
+void count_by_tile(const Frame &f, const Rect *rects, uint32_t *start) {
+  const int wide = f.tiles_x + 1, tall = f.tiles_y + 1;
+  Buffer<int32_t> corners;
+  int32_t *c = corners.need(wide * tall);
+  std::memset(c, 0, static_cast<size_t>(wide) * tall * sizeof(int32_t));
   for (int64_t k = 0; k < f.visible; ++k) {
-    const Footprint &p = f.footprints.data[sorted[k]];
-    Rect rect{p.x0, p.x1, p.y0, p.y1};
-    std::memcpy(&f.rects.data[k], &rect, 8);
-    f.first_slot.data[sorted[k]] = f.pairs;
-    f.pairs += static_cast<int64_t>(p.x1 - p.x0) * (p.y1 - p.y0);
+    const Rect r = rects[k];
+    ++c[r.y0 * wide + r.x0], --c[r.y0 * wide + r.x1], --c[r.y1 * wide + r.x0], ++c[r.y1 * wide + r.x1];
   }
-  int64_t *start = f.tile_start.need(tiles + 1), *cursor = f.cursor.need(tiles);
-  int32_t *list = f.list.need(f.pairs);
-  std::memset(f.touched.need(f.pairs), 0, f.pairs * sizeof(uint64_t));
-  auto each = [&](int band, auto visit) {
-    int top = band * band_rows, bottom = top + band_rows < f.tiles_y ? top + band_rows : f.tiles_y;
-    for (int64_t k = 0; k < f.visible; ++k) {
-      Rect rect;
-      std::memcpy(&rect, &f.rects.data[k], 8);
-      int y0 = rect.y0 > top ? rect.y0 : top, y1 = rect.y1 < bottom ? rect.y1 : bottom;
-      for (int y = y0; y < y1; ++y)
-        for (int x = rect.x0; x < rect.x1; ++x) visit(k, y * f.tiles_x + x);
-    }
-  };
-  std::memset(cursor, 0, tiles * sizeof(int64_t));
-  parallel(bands, [&](int band) { each(band, [&](int64_t, int tile) { ++cursor[tile]; }); });
   start[0] = 0;
-  for (int tile = 0; tile < tiles; ++tile) {
-    start[tile + 1] = start[tile] + cursor[tile];
-    cursor[tile] = start[tile];
+  for (int y = 0; y < f.tiles_y; ++y)
+    for (int x = 0; x < f.tiles_x; ++x) {
+      int32_t &here = c[y * wide + x];
+      here += (x ? c[y * wide + x - 1] : 0) + (y ? c[(y - 1) * wide + x] : 0) - (x && y ? c[(y - 1) * wide + x - 1] : 0);
+      start[y * f.tiles_x + x + 1] = start[y * f.tiles_x + x] + static_cast<uint32_t>(here);
+    }
+}
+
+// Lists of splats by tile, front to back; the picture's two halves are independent of each other.
+void bin(Frame &f, const uint32_t *sorted) {
+  const int tiles = f.tiles_x * f.tiles_y;
+  uint32_t *first = f.first_slot.need(f.splats.n);
+  f.pairs = 0;
+  for (int64_t i = 0; i < f.splats.n; ++i) {
+    const Rect r = f.rects.data[i];
+    first[i] = static_cast<uint32_t>(f.pairs);
+    f.pairs += static_cast<int64_t>(r.x1 - r.x0) * (r.y1 - r.y0);
   }
-  parallel(bands, [&](int band) {
-    each(band, [&](int64_t k, int tile) { list[cursor[tile]++] = static_cast<int32_t>(sorted[k]); });
+  if (f.pairs > MAX_PAIRS) throw std::bad_alloc();
+  Rect *rects = f.sorted_rects.need(f.visible);
+  for (int64_t k = 0; k < f.visible; ++k) rects[k] = f.rects.data[sorted[k]];
+  uint32_t *start = f.tile_start.need(tiles + 1), *cursor = f.cursor.need(tiles);
+  count_by_tile(f, rects, start);
+  std::memcpy(cursor, start, tiles * sizeof(uint32_t));
+  Entry *list = f.list.need(f.pairs);
+  parallel(2, [&](int half) {
+    const int top = half ? f.tiles_y / 2 : 0, bottom = half ? f.tiles_y : f.tiles_y / 2;
+    for (int64_t k = 0; k < f.visible; ++k) {
+      const Rect r = rects[k];
+      const int y0 = r.y0 > top ? r.y0 : top, y1 = r.y1 < bottom ? r.y1 : bottom;
+      for (int y = y0; y < y1; ++y) {
+        uint32_t slot = first[sorted[k]] + static_cast<uint32_t>((y - r.y0) * (r.x1 - r.x0));
+        for (int x = r.x0; x < r.x1; ++x) list[cursor[y * f.tiles_x + x]++] = {sorted[k], slot++};
+      }
+    }
   });
 }
 
@@ -107,7 +114,7 @@ bool render_forward(Frame &f) {
   const int64_t n = f.splats.n;
   f.tiles_x = (f.camera.width + TILE - 1) / TILE;
   f.tiles_y = (f.camera.height + TILE - 1) / TILE;
-  f.footprints.need(n);
+  f.footprints.need(n), f.rects.need(n), f.depths.need(n);
   Buffer<uint8_t> fit;
   fit.need(chunks(n));
   parallel(chunks(n), [&](int part) {
@@ -117,6 +124,9 @@ bool render_forward(Frame &f) {
   for (int part = 0; part < chunks(n); ++part)
     if (!fit.data[part]) return false;
   bin(f, sort_by_depth(f));
+  f.touched.need(f.pairs);
+  const size_t lanes = static_cast<size_t>(f.tiles_x) * f.tiles_y * TILE * TILE;
+  f.light.need(lanes), f.finished.need(lanes);
   parallel(f.tiles_x * f.tiles_y, [&](int tile) { kernel.raster_tile(f, tile); });
   return true;
 }
@@ -125,6 +135,7 @@ void render_backward(Frame &f, const SplatGrads &grads, double *camera_grad) {
   const Kernels kernel = kernels(f.isa);
   const int64_t n = f.splats.n;
   f.slots.need(f.pairs * SLOT);
+  std::memset(f.used.need(f.pairs), 0, f.pairs);
   parallel(f.tiles_x * f.tiles_y, [&](int tile) { kernel.raster_tile_back(f, tile); });
   const int parts = chunks(n);
   f.camera_part.need(static_cast<size_t>(parts) * 15);
@@ -152,8 +163,8 @@ int64_t consulted(const Frame &f) {
     for (int y = y0; y < y0 + TILE && y < f.camera.height; ++y)
       for (int x = x0; x < x0 + TILE && x < f.camera.width; ++x) {
         float light = 1;
-        for (int64_t k = f.tile_start.data[tile]; k < f.tile_start.data[tile + 1] && light >= LIGHT_MIN; ++k, ++total) {
-          const Footprint &p = f.footprints.data[f.list.data[k]];
+        for (uint32_t k = f.tile_start.data[tile]; k < f.tile_start.data[tile + 1] && light >= LIGHT_MIN; ++k, ++total) {
+          const Footprint &p = f.footprints.data[f.list.data[k].splat];
           float dx = static_cast<float>(x + 0.5 - p.x), dy = static_cast<float>(y + 0.5 - p.y);
           float u = p.p * dx + p.r * dy, v = p.s * dy;
           float alpha = __builtin_exp2f(p.log2_opacity - u * u - v * v);

@@ -39,6 +39,45 @@ inline void add3(Wide &high, Wide &low, Wide a, Wide b, Wide c) {
 #endif
 }
 
+// Which of eight 64-bit words, 64-byte aligned, are not zero: bit k for word k.
+inline uint32_t lit_words(const uint64_t *words) {
+#if SPIKERIG_LANES == 16
+  const __m512i w = _mm512_load_si512(words);
+  return _mm512_test_epi64_mask(w, w);
+#elif SPIKERIG_LANES == 8
+  const __m256i zero = _mm256_setzero_si256(), *w = reinterpret_cast<const __m256i *>(words);
+  const auto dark = [&](int k) { return _mm256_movemask_pd(_mm256_castsi256_pd(_mm256_cmpeq_epi64(w[k], zero))); };
+  return static_cast<uint32_t>(dark(0) | dark(1) << 4) ^ 255;
+#else
+  uint32_t lit = 0;
+  for (int k = 0; k < 8; ++k) lit |= static_cast<uint32_t>(words[k] != 0) << k;
+  return lit;
+#endif
+}
+
+// Writes `value` to those of to[0 .. 63] whose bit is set.
+inline void put_where(int32_t *to, uint64_t bits, int32_t value) {
+#if SPIKERIG_LANES == 16
+  if (__builtin_popcountll(bits) > 4) {
+    const __m512i v = _mm512_set1_epi32(value);
+    for (int k = 0; k < 4; ++k) _mm512_mask_storeu_epi32(to + 16 * k, static_cast<__mmask16>(bits >> (16 * k)), v);
+    return;
+  }
+#elif SPIKERIG_LANES == 8
+  if (__builtin_popcountll(bits) > 12) {
+    const __m256i v = _mm256_set1_epi32(value), bit = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
+    for (int k = 0; k < 8; ++k) {
+      const __m256i byte = _mm256_set1_epi32(static_cast<int32_t>(bits >> (8 * k) & 255));
+      const __m256i hit = _mm256_cmpeq_epi32(_mm256_and_si256(byte, bit), bit);
+      __m256i *at = reinterpret_cast<__m256i *>(to + 8 * k);
+      _mm256_storeu_si256(at, _mm256_blendv_epi8(_mm256_loadu_si256(at), v, hit));
+    }
+    return;
+  }
+#endif
+  for (; bits; bits &= bits - 1) to[__builtin_ctzll(bits)] = value;
+}
+
 // ---- bits to bytes: SPREAD pixels from SPREAD/8 bytes ---------------------------------------------------------
 
 inline uint64_t spread8(uint8_t byte) {  // 8 bits to 8 bytes of 0 or 1, first pixel lowest

@@ -27,6 +27,7 @@ constexpr double CULL_MARGIN = 1.0;         // centres beyond the picture plus t
 constexpr double LOG_SCALE_MAX = 30.0;      // log scales are clamped to +-this
 constexpr double QUAT_MIN = 1e-24;          // squared length below which a quaternion means "no rotation"
 constexpr int SLOT = 12;                    // floats of a gradient slot; nine are used
+constexpr int64_t MAX_PAIRS = int64_t(1) << 31;  // (tile, splat) pairs of a picture
 constexpr int CHUNK = 512;                  // splats of one part
 
 // A growing array without initialisation; contents are lost on growth.
@@ -71,16 +72,24 @@ struct SplatGrads {
   float *means, *quats, *log_scales, *logits, *sh, *means2d;
 };
 
-struct Footprint {
-  double x, y;                  // centre, pixels
-  float p, r, s;                // power / ln 2 = u^2 + v^2, u = p dx + r dy, v = s dy
-  float log2_opacity;           // alpha = 2^(log2_opacity - u^2 - v^2)
-  float red, green, blue;       // not negative
-  float reach_x, reach_y;       // half size of the box that holds every pixel with alpha >= ALPHA_MIN
-  float depth;
-  uint16_t x0, x1, y0, y1;      // tiles, half-open; empty when culled
+struct alignas(64) Footprint {
+  double x, y;             // centre, pixels
+  float p, r, s;           // power / ln 2 = u^2 + v^2, u = p dx + r dy, v = s dy
+  float log2_opacity;      // alpha = 2^(log2_opacity - u^2 - v^2)
+  float red, green, blue;  // not negative
+  float reach_x, reach_y;  // half size of the box that holds every pixel with alpha >= ALPHA_MIN
+  float room;              // u^2 + v^2 on the rim, where alpha = ALPHA_MIN
+  float lean;              // dy of the rim's rightmost point; the leftmost is at -dy
 };
 static_assert(sizeof(Footprint) == 64);
+
+struct Rect {  // tiles, half-open; empty when culled
+  uint16_t x0, x1, y0, y1;
+};
+
+struct Entry {  // of a tile's list
+  uint32_t splat, slot;
+};
 
 struct Frame {  // one picture on its way
   Isa isa = Isa::plain;
@@ -91,15 +100,20 @@ struct Frame {  // one picture on its way
   bool antialias = false;
   int tiles_x = 0, tiles_y = 0;
   int64_t visible = 0, pairs = 0;
-  Buffer<Footprint> footprints;  // [n]
-  Buffer<int64_t> first_slot;    // [n] slot of a splat's first tile
-  Buffer<uint32_t> keys, keys2, order, order2;
-  Buffer<uint64_t> rects, slots_sorted;
-  Buffer<int64_t> tile_start;    // [tiles + 1]
-  Buffer<int64_t> cursor;        // [tiles]
-  Buffer<int32_t> list;          // [pairs] splat, by tile, front to back
-  Buffer<uint64_t> touched;      // [pairs] by slot: blocks of the tile where the splat left light
-  Buffer<float> slots;           // [pairs, SLOT]
+  Buffer<Footprint> footprints;    // [n]
+  Buffer<Rect> rects;              // [n]
+  Buffer<float> depths;            // [n]
+  Buffer<uint32_t> first_slot;     // [n] slot of a splat's first tile; its others follow, row by row
+  Buffer<uint32_t> keys, keys2, order, order2;  // of the sort
+  Buffer<Rect> sorted_rects;       // [visible]
+  Buffer<uint32_t> tile_start;     // [tiles + 1]
+  Buffer<uint32_t> cursor;         // [tiles]
+  Buffer<Entry> list;              // [pairs] by tile, front to back
+  Buffer<uint64_t> touched;        // [pairs] by place in `list`: blocks of the tile where the splat left light
+  Buffer<float> light;             // [tiles, TILE * TILE] left at the end, in the kernel's order of a tile's pixels
+  Buffer<int32_t> finished;        // same: place in the tile's list where the pixel was finished
+  Buffer<float> slots;             // [pairs, SLOT]
+  Buffer<uint8_t> used;            // [pairs] 1 where the slot holds anything
   Buffer<double> camera_part;    // [chunks, 15]
   float *image = nullptr, *alpha = nullptr;                    // [H, W, 3], [H, W]
   const float *image_grad = nullptr, *alpha_grad = nullptr;  // same shapes

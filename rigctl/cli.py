@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -16,7 +16,8 @@ from spikerig.dataset.terminal import Progress, emit, note
 def _workers(asked: int) -> int:
     if asked < 0:
         raise UsageError("workers are counted from 1; 0 means one a core", value=asked)
-    return asked or len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else asked or os.cpu_count() or 1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return asked or cores
 
 
 def capture(
@@ -39,12 +40,41 @@ def capture(
     spec = with_changes(load_scene_toml(scene), seed=seed, views=views)
     bar = Progress(f"simulating '{spec.name}'", spec.orbit.views, "views")
     told = play(spec, out, workers=_workers(workers), force=force, done=lambda taken: bar.step())
+    _tell("spikerig.sim.capture/1", out, told, began, as_json)
+
+
+def frames(
+    folder: Annotated[Path, typer.Argument(help="Sub-frames with poses, laid out as in docs/sim_frames.md.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The scene file to write (.h5).")],
+    settings: Annotated[
+        Path | None, typer.Option(help="TOML with exposure, sensor, effects, points; else FOLDER/capture.toml.")
+    ] = None,
+    protocol: Annotated[str, typer.Option(help="rig or paper, in place of the settings'.")] = "",
+    seed: Annotated[int | None, typer.Option(help="Of noise and points, in place of the settings'.")] = None,
+    workers: Annotated[int, typer.Option(help="Processes; 0: one a core. The bits do not depend on it.")] = 0,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
+) -> None:
+    """Simulate a capture from rendered sub-frames: linear EXR (or sRGB PNG) sequences with poses become a scene."""
+    from spikerig.rigctl.sim.folder import read_folder
+    from spikerig.rigctl.sim.frames import capture_folder
+
+    began = time.monotonic()
+    found = read_folder(folder, settings, protocol=protocol, seed=seed)
+    bar = Progress(f"simulating '{found.rig.name}'", len(found.views), "views")
+    told = capture_folder(found, out, workers=_workers(workers), force=force, done=lambda taken: bar.step())
+    _tell("spikerig.sim.frames/1", out, told, began, as_json)
+    if told["points"] == 0:
+        note("no initial points: training will start from random ones, some 10 dB worse; give points or depth")
+
+
+def _tell(schema: str, out: Path, told: dict[str, Any], began: float, as_json: bool) -> None:
     told = {"out": str(out), **told, "seconds": time.monotonic() - began}
     if as_json:
-        emit("spikerig.sim.capture/1", told)
+        emit(schema, told)
+    blur = f", blurry pictures {told['blurry_psnr_db']:.2f} dB from sharp" if told["train_views"] else ""
     note(
         f"{out}: {told['train_views']} train and {told['test_views']} test views of {told['size'][0]}x"
         f"{told['size'][1]}, {told['ticks']} ticks an exposure, {told['spikes_mean']:.1f} spikes a pixel (most "
-        f"{told['spikes_max']}), blurry pictures {told['blurry_psnr_db']:.2f} dB from sharp, pose label "
-        f"'{told['pose_label']}', seed {told['seed']}, {told['seconds']:.1f} s"
+        f"{told['spikes_max']}){blur}, pose label '{told['pose_label']}', seed {told['seed']}, {told['seconds']:.1f} s"
     )

@@ -137,8 +137,6 @@ def render_forward(
 def render_backward(
     state: _native.Render,
     arrays: Sequence[np.ndarray],
-    image: np.ndarray,
-    alpha: np.ndarray,
     image_grad: np.ndarray,
     alpha_grad: np.ndarray,
 ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
@@ -151,7 +149,7 @@ def render_backward(
     grads = [np.empty_like(a) for a in arrays]
     screen = np.empty((len(arrays[3]), 2), np.float32)
     camera = np.empty(12, np.float64)
-    _native.render_backward(state, *arrays, image, alpha, image_grad, alpha_grad, *grads, screen, camera)
+    _native.render_backward(state, *arrays, image_grad, alpha_grad, *grads, screen, camera)
     return grads, screen, camera.reshape(3, 4)
 
 

@@ -134,7 +134,7 @@ def _tell(task: Task, record: dict[str, Any]) -> None:
     note(f"  pose label '{config.pose_label}'; {len(set(task.targets.colour))} sub-pose(s) a view for colour")
     if config.tfs_weight > 0:
         note(
-            f"  TfS: w = {config.tfs_weight:g} read as '{config.weight_reading}' = {task.weight:g} on means over pixels; "
+            f"  TfS: w = {config.tfs_weight:g} read as '{config.weight_reading}': {task.weight:g} on means; "
             f"{len(task.targets.tfs)} instant(s), {config.textures}, {config.tfs_domain}"
         )
     if (gray := task.targets.gray) is not None and config.tfs_weight > 0:

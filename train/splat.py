@@ -80,21 +80,16 @@ class _Render(torch.autograd.Function):
         out = (torch.from_numpy(image), torch.from_numpy(alpha), torch.from_numpy(radii))
         ctx.mark_non_differentiable(out[2])
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*tensors, *out[:2])
+        ctx.save_for_backward(*tensors)
         ctx.state, ctx.pose = state, (pose.dtype, pose.device)
         return out
 
     @staticmethod
     def backward(ctx: Any, image_grad: Any, alpha_grad: Any, _radii: Any) -> Any:  # type: ignore[override]
-        *tensors, image, alpha = ctx.saved_tensors
-        wanted = [torch.zeros_like(x) if g is None else g for x, g in ((image, image_grad), (alpha, alpha_grad))]
-        grads, screen, camera = kernels.render_backward(
-            ctx.state,
-            _arrays(tensors),
-            image.detach().numpy(),
-            alpha.detach().numpy(),
-            *(g.contiguous().numpy() for g in wanted),
-        )
+        width, height = ctx.state.width, ctx.state.height
+        shapes = ((image_grad, (height, width, 3)), (alpha_grad, (height, width)))
+        wanted = [np.zeros(size, np.float32) if g is None else g.contiguous().numpy() for g, size in shapes]
+        grads, screen, camera = kernels.render_backward(ctx.state, _arrays(ctx.saved_tensors), *wanted)
         dtype, device = ctx.pose
         pose_grad = torch.from_numpy(camera).to(device, dtype)
         return None, torch.from_numpy(screen), pose_grad, *(torch.from_numpy(g) for g in grads)

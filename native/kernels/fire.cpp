@@ -20,12 +20,46 @@ constexpr int64_t TICKS = 64;            // ticks a group runs before the next g
 constexpr double UNIT = 4294967296.0;    // 2^32
 constexpr double ROUND = 6755399441055744.0;  // 1.5 * 2^52: adding it leaves the nearest integer in the low bits
 
-inline int64_t as_int(double rounded) {
-  int64_t i, zero;
-  const double r = ROUND;
-  std::memcpy(&i, &rounded, 8);
-  std::memcpy(&zero, &r, 8);
-  return i - zero;
+// Vectors of doubles and of the integers of the same width; the compiler does not find these loops by itself.
+constexpr int DOUBLES = sizeof(Wide) / 8;
+typedef double Doubles __attribute__((vector_size(8 * DOUBLES)));
+typedef uint64_t Longs __attribute__((vector_size(8 * DOUBLES)));
+typedef float Floats __attribute__((vector_size(4 * DOUBLES)));
+typedef uint32_t Halves __attribute__((vector_size(4 * DOUBLES)));
+
+template <class V, class T>
+inline V load(const T *from) {
+  V x;
+  std::memcpy(&x, from, sizeof x);
+  return x;
+}
+template <class V, class T>
+inline void store(T *to, V x) {
+  std::memcpy(to, &x, sizeof x);
+}
+inline void store_low(uint32_t *to, Longs x) { store(to, __builtin_convertvector(x, Halves)); }
+
+// The integer (two's complement) in a sum to which ROUND was added.
+inline Longs as_int(Doubles rounded) { return (Longs)rounded - (Longs)(Doubles{} + ROUND); }
+
+// V0 and D of eight, four or two pixels: whole units, and 2^-32 of a unit in the low words. `ends` has every bit that
+// the light at either end has.
+struct Slope {
+  Longs v, v_low, d, d_low, ends;
+};
+
+template <bool ramp>
+inline Slope slope(const float *from, const float *to, double share) {
+  const Doubles a = __builtin_convertvector(load<Floats>(from), Doubles) * UNIT + ROUND;
+  if (!ramp) return {as_int(a), Longs{}, Longs{}, Longs{}, as_int(a)};
+  const Doubles b = __builtin_convertvector(load<Floats>(to), Doubles) * UNIT + ROUND;
+  const Doubles d = (b - a) * share, half = d * 0.5;
+  const Doubles whole = d + ROUND, half_whole = half + ROUND;
+  const Longs low = as_int((d - (whole - ROUND)) * UNIT + ROUND);
+  const Longs half_low = as_int((half - (half_whole - ROUND)) * UNIT + ROUND);
+  // low parts lie in [-2^31, 2^31]: a negative one borrows a whole unit
+  return {as_int(a) + as_int(half_whole) - (half_low >> 63), half_low, as_int(whole) - (low >> 63), low,
+          as_int(a) | as_int(b)};
 }
 
 struct Pixels {
@@ -38,29 +72,28 @@ struct Pixels {
   alignas(64) uint64_t clipped[PIXELS];
   bool bright[PIXELS / GROUP];  // groups with a pixel at or above one threshold a tick
 
-  void begin_segment(int64_t pixels, int64_t ticks, bool ramp) {
+  template <bool ramp>
+  void begin_segment(int64_t pixels, int64_t ticks) {
     const double share = 1.0 / static_cast<double>(ticks);
     for (int64_t g = 0; g < pixels; g += GROUP) {
-      double most = 0;
-      for (int64_t i = g; i < g + GROUP; ++i) {
-        const double a = (from[i] * UNIT + ROUND) - ROUND;
-        const double b = ramp ? (to[i] * UNIT + ROUND) - ROUND : a;
-        most = std::max(most, std::max(a, b));
-        const double slope = (b - a) * share, half = slope * 0.5;
-        const double whole = slope + ROUND, half_whole = half + ROUND;
-        const int64_t low = as_int((slope - (whole - ROUND)) * UNIT + ROUND);
-        const int64_t half_low = as_int((half - (half_whole - ROUND)) * UNIT + ROUND);
-        // low parts lie in [-2^31, 2^31]: borrow a whole unit where they are negative
-        const int64_t borrow = static_cast<int64_t>(static_cast<uint64_t>(low) >> 63);
-        const int64_t half_borrow = static_cast<int64_t>(static_cast<uint64_t>(half_low) >> 63);
-        d[i] = as_int(whole) - borrow;
-        v[i] = as_int(a + ROUND) + as_int(half_whole) - half_borrow;
-        d_low[i] = static_cast<uint32_t>(low);
-        v_low[i] = static_cast<uint32_t>(half_low);
-        d_word[i] = static_cast<uint32_t>(d[i]);
-        v_word[i] = static_cast<uint32_t>(v[i]);
+      Longs ends{};
+      for (int64_t i = g; i < g + GROUP; i += DOUBLES) {
+        const Slope s = slope<ramp>(from + i, to + i, share);
+        ends |= s.ends;
+        store_low(v_word + i, s.v);
+        store_low(v_low + i, s.v_low);
+        store_low(d_word + i, s.d);
+        store_low(d_low + i, s.d_low);
       }
-      bright[g / GROUP] = most >= UNIT;
+      uint64_t either = 0;
+      for (int k = 0; k < DOUBLES; ++k) either |= ends[k];
+      bright[g / GROUP] = (either >> 32) != 0;
+      if (!bright[g / GROUP]) continue;
+      for (int64_t i = g; i < g + GROUP; i += DOUBLES) {
+        const Slope s = slope<ramp>(from + i, to + i, share);
+        store(v + i, s.v);
+        store(d + i, s.d);
+      }
     }
   }
 
@@ -148,7 +181,10 @@ void fire(const Light &light, uint32_t *charge, uint8_t *bits, double *clipped) 
         std::copy_n(from + pixel, n, state.from + i);
         std::copy_n(to + pixel, n, state.to + i);
       });
-      state.begin_segment(pixels, ticks, !light.hold);
+      if (light.hold)
+        state.begin_segment<false>(pixels, ticks);
+      else
+        state.begin_segment<true>(pixels, ticks);
       uint8_t *out = bits + (light.knots[k] - light.knots[0]) * frame + at.begin;
       for (int64_t t = 0; t < ticks; t += TICKS) {
         const int64_t n = std::min(TICKS, ticks - t);

@@ -29,19 +29,30 @@ inline vf load(const float *p) {
   __builtin_memcpy(&out, p, sizeof out);
   return out;
 }
+inline vd load_wide(const double *p) {
+  vd out;
+  __builtin_memcpy(&out, p, sizeof out);
+  return out;
+}
 inline void store(float *p, vf x) { __builtin_memcpy(p, &x, sizeof x); }
 
 // A lane mask, the test for any lane set, and zero where the mask is not set.
 #if defined(SPIKERIG_LANES) && SPIKERIG_LANES == 16
 using mask = __mmask16;
 inline mask at_least(vf a, vf b) { return _mm512_cmp_ps_mask(a, b, _CMP_GE_OQ); }
+inline mask at_least(vi a, vi b) { return _mm512_cmp_epi32_mask((__m512i)a, (__m512i)b, _MM_CMPINT_NLT); }
 inline mask both(mask a, mask b) { return static_cast<mask>(a & b); }
+inline mask without(mask a, mask b) { return static_cast<mask>(a & ~b); }
+inline vi choose(mask m, vi a, vi b) { return (vi)_mm512_mask_mov_epi32((__m512i)b, m, (__m512i)a); }
 inline bool any(mask m) { return m != 0; }
 inline vf keep(mask m, vf x) { return _mm512_maskz_mov_ps(m, x); }
 #else
 using mask = vi;
 inline mask at_least(vf a, vf b) { return a >= b; }
+inline mask at_least(vi a, vi b) { return a >= b; }
 inline mask both(mask a, mask b) { return a & b; }
+inline mask without(mask a, mask b) { return a & ~b; }
+inline vi choose(mask m, vi a, vi b) { return (m & a) | (~m & b); }
 inline vf keep(mask m, vf x) { return (vf)(m & (vi)x); }
 #if defined(SPIKERIG_LANES)
 inline bool any(mask m) { return _mm256_movemask_ps((__m256)m) != 0; }
@@ -59,7 +70,7 @@ inline vf larger(vf a, vf b) { return a > b ? a : b; }
 inline vd smaller(vd a, vd b) { return a < b ? a : b; }
 inline vd larger(vd a, vd b) { return a > b ? a : b; }
 
-// 2^x for -126 <= x <= 126, relative error below 2e-7 (minimax of degree 5 with p(0) = 1); outside that the lane holds any value.
+// 2^x for -126 <= x <= 126, relative error below 2e-7 (a minimax of degree 5 with p(0) = 1); outside it, any value.
 inline vf exp2_lanes(vf x) {
   const float magic = 12582912.0f;  // 1.5 * 2^23: adding it rounds to an integer kept in the low bits
   vf shifted = x + magic;
@@ -94,15 +105,41 @@ inline vd sqrt_lanes(vd x) {
   return out;
 }
 
-// Sums over the lanes of nine vectors, each in one fixed order, to out[0..8]; out has room for 12.
-inline float sum_lanes(vf x) {
-  float part[LANES];
-  store(part, x);
-  for (int step = LANES / 2; step >= 1; step /= 2)
-    for (int i = 0; i < step; ++i) part[i] += part[i + step];
-  return part[0];
+// Natural logarithm of normal x > 0, relative error a few 1e-16.
+inline vd log_lanes(vd x) {
+  const vl bits = (vl)x, root_half = vl{} + 0x3fe6a09e667f3bcd;
+  const vl exponent = (bits - root_half) >> 52;  // so that the rest is in [sqrt(1/2), sqrt(2))
+  const vd m = (vd)(bits - (exponent << 52));
+  const double magic = 6755399441055744.0;
+  const vd n = (vd)(exponent + (vl)splat(magic)) - magic;
+  const vd t = (m - 1.0) / (m + 1.0), tt = t * t;
+  vd p = splat(1.0 / 21);
+  for (int odd = 19; odd >= 3; odd -= 2) p = p * tt + 1.0 / odd;
+  return n * 6.93147180369123816490e-01 + (2.0 * t + (2.0 * t * tt * p + n * 1.90821492927058770002e-10));
 }
 
+// Sum over the lanes, halves first: one fixed order.
+inline float sum_lanes(vf x) {
+#if defined(SPIKERIG_LANES) && SPIKERIG_LANES == 16
+  x += __builtin_shufflevector(x, x, 8, 9, 10, 11, 12, 13, 14, 15, 0, 1, 2, 3, 4, 5, 6, 7);
+  x += __builtin_shufflevector(x, x, 4, 5, 6, 7, 0, 1, 2, 3, 12, 13, 14, 15, 8, 9, 10, 11);
+  x += __builtin_shufflevector(x, x, 2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13);
+#elif defined(SPIKERIG_LANES)
+  x += __builtin_shufflevector(x, x, 4, 5, 6, 7, 0, 1, 2, 3);
+  x += __builtin_shufflevector(x, x, 2, 3, 0, 1, 6, 7, 4, 5);
+#else
+  x += __builtin_shufflevector(x, x, 2, 3, 0, 1);
+#endif
+  return x[0] + x[1];
+}
+
+inline double sum_lanes(vd x) {
+  double total = 0;
+  for (int i = 0; i < WIDE; ++i) total += x[i];
+  return total;
+}
+
+// Sums over the lanes of nine vectors, each in one fixed order, to out[0..8].
 #if defined(SPIKERIG_LANES) && SPIKERIG_LANES == 16
 inline vf fold_half(vf a, vf b) {  // two sums of 8
   return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23) +

@@ -1,5 +1,6 @@
 // Real spherical harmonics up to degree 3, in the order and signs of 3D Gaussian Splatting.
 #pragma once
+#include "../train_kernels.hpp"
 
 namespace spikerig::SPIKERIG_ISA {
 
@@ -53,6 +54,21 @@ inline void harmonics_back(int degree, float x, float y, float z, const float *w
     gz += b * x * y + 8 * c * y * z + d * (6 * zz - 3 * xx - 3 * yy) + 8 * e * x * z + f * (xx - yy);
   }
   out[0] = gx, out[1] = gy, out[2] = gz;
+}
+
+struct Direction {
+  double x, y, z, inverse;  // unit, camera centre to splat; 1 / distance
+};
+
+// The harmonics at splat i as the camera sees it; the direction too when `seen` is not null and the degree needs one.
+inline void direction_basis(const Frame &f, int64_t i, float *basis, Direction *seen) {
+  if (f.sh_degree == 0) return harmonics(0, 0, 0, 0, basis);
+  const float *mean = f.splats.means + 3 * i;
+  const double *centre = f.camera.centre, x = mean[0] - centre[0], y = mean[1] - centre[1], z = mean[2] - centre[2];
+  const double inverse = 1.0 / __builtin_sqrt(x * x + y * y + z * z);
+  const Direction d{x * inverse, y * inverse, z * inverse, inverse};
+  harmonics(f.sh_degree, static_cast<float>(d.x), static_cast<float>(d.y), static_cast<float>(d.z), basis);
+  if (seen) *seen = d;
 }
 
 }  // namespace spikerig::SPIKERIG_ISA

@@ -14,44 +14,47 @@ struct Incoming {  // d loss / d: log opacity, p, r, s (in units of the power it
   V3 from_centre;  // mean - camera centre, through the SH direction
 };
 
-// A splat's slots, added in tile order, in double.
+// A splat's slots, added in tile order, in double; false when all are empty.
 bool gather(const Frame &f, int64_t i, double *sum) {
-  const Footprint &p = f.footprints.data[i];
-  for (int k = 0; k < 9; ++k) sum[k] = 0;
+  const Rect r = f.rects.data[i];
+  vd low[8 / WIDE] = {};
+  double last_sum = 0;
   bool some = false;
-  int64_t slot = f.first_slot.data[i], last = slot + static_cast<int64_t>(p.x1 - p.x0) * (p.y1 - p.y0);
+  size_t slot = f.first_slot.data[i];
+  const size_t last = slot + static_cast<size_t>(r.x1 - r.x0) * (r.y1 - r.y0);
   for (; slot < last; ++slot) {
-    if (!f.touched.data[slot]) continue;
+    if (!f.used.data[slot]) continue;
     some = true;
     const float *from = f.slots.data + slot * SLOT;
-    for (int k = 0; k < 9; ++k) sum[k] += from[k];
+    for (int k = 0; k < 8; ++k) low[k / WIDE][k % WIDE] += from[k];
+    last_sum += from[8];
   }
+  __builtin_memcpy(sum, low, sizeof low);
+  sum[8] = last_sum;
   return some;
 }
 
 // Colour gradients to SH gradients; returns d loss / d (mean - centre) in out.
 void colour_back(const Frame &f, int64_t i, const double *rgb_grad, float *sh_grad, double *out) {
-  const float *mean = f.splats.means + 3 * i, *sh = f.splats.sh + 3 * f.splats.sh_rows * i;
+  const float *sh = f.splats.sh + 3 * f.splats.sh_rows * i;
   const Footprint &p = f.footprints.data[i];
-  float g[3] = {p.red > 0 ? float(rgb_grad[0]) : 0.0f, p.green > 0 ? float(rgb_grad[1]) : 0.0f,
-                p.blue > 0 ? float(rgb_grad[2]) : 0.0f};
-  double dx = mean[0] - f.camera.centre[0], dy = mean[1] - f.camera.centre[1], dz = mean[2] - f.camera.centre[2];
-  double inverse = 1.0 / __builtin_sqrt(dx * dx + dy * dy + dz * dz);
-  dx *= inverse, dy *= inverse, dz *= inverse;
+  const float g[3] = {p.red > 0 ? float(rgb_grad[0]) : 0.0f, p.green > 0 ? float(rgb_grad[1]) : 0.0f,
+                      p.blue > 0 ? float(rgb_grad[2]) : 0.0f};
   float basis[16], weight[16], toward[3];
-  harmonics(f.sh_degree, float(dx), float(dy), float(dz), basis);
-  int rows = (f.sh_degree + 1) * (f.sh_degree + 1);
+  Direction d{};
+  direction_basis(f, i, basis, &d);
+  const int rows = (f.sh_degree + 1) * (f.sh_degree + 1);
   for (int k = 0; k < rows; ++k)
     for (int c = 0; c < 3; ++c) sh_grad[3 * k + c] = basis[k] * g[c];
   for (int k = 3 * rows; k < 3 * f.splats.sh_rows; ++k) sh_grad[k] = 0;
   out[0] = out[1] = out[2] = 0;
   if (f.sh_degree == 0) return;
   for (int k = 0; k < rows; ++k) weight[k] = sh[3 * k] * g[0] + sh[3 * k + 1] * g[1] + sh[3 * k + 2] * g[2];
-  harmonics_back(f.sh_degree, float(dx), float(dy), float(dz), weight, toward);
-  double along = dx * toward[0] + dy * toward[1] + dz * toward[2];
-  out[0] = (toward[0] - dx * along) * inverse;
-  out[1] = (toward[1] - dy * along) * inverse;
-  out[2] = (toward[2] - dz * along) * inverse;
+  harmonics_back(f.sh_degree, float(d.x), float(d.y), float(d.z), weight, toward);
+  const double along = d.x * toward[0] + d.y * toward[1] + d.z * toward[2];
+  out[0] = (toward[0] - d.x * along) * d.inverse;
+  out[1] = (toward[1] - d.y * along) * d.inverse;
+  out[2] = (toward[2] - d.z * along) * d.inverse;
 }
 
 void zero(const SplatGrads &out, int64_t i, int sh_rows) {
@@ -64,10 +67,10 @@ void zero(const SplatGrads &out, int64_t i, int sh_rows) {
 
 // p = sqrt(c22 / det), r = -c12 / sqrt(c22 det), s = 1 / sqrt(c22) back to the rows a and b.
 void footprint_back(const Frame &f, const Geometry &g, const Incoming &in, V3 &ga, V3 &gb) {
-  vd p = sqrt_lanes(g.c22 / g.det), r = -g.c12 / sqrt_lanes(g.c22 * g.det), s = 1.0 / sqrt_lanes(g.c22);
-  vd g12 = -in.r / sqrt_lanes(g.c22 * g.det);
-  vd g22 = (in.p * p - in.r * r - in.s * s) / (2.0 * g.c22);
-  vd gdet = -(in.p * p + in.r * r) / (2.0 * g.det);
+  const vd root22 = sqrt_lanes(g.c22), root = 1.0 / sqrt_lanes(g.det), s = 1.0 / root22;
+  const vd p = root22 * root, g12 = -in.r * s * root, r = -g.c12 * s * root;
+  const vd g22 = 0.5 * (in.p * p - in.r * r - in.s * s) * s * s;
+  vd gdet = -0.5 * (in.p * p + in.r * r) * root * root;
   vd gdet0 = gdet;  // through det = det0 + ...
   if (f.antialias) {  // log opacity += log(det0 / det) / 2 above its floor
     vl free = g.det0 > COMPENSATION_MIN * COMPENSATION_MIN * g.det;
@@ -78,6 +81,16 @@ void footprint_back(const Frame &f, const Geometry &g, const Incoming &in, V3 &g
   vd dilated = 2.0 * DILATION * gdet;
   ga = g.b * g12 + g.a * dilated + cross(g.b, g.normal) * (2.0 * gdet0);
   gb = g.a * g12 + g.b * (2.0 * g22 + dilated) + cross(g.normal, g.a) * (2.0 * gdet0);
+}
+
+struct Columns {
+  vd of[4];
+};
+
+// The lanes that are set, to rows of `stride` floats.
+void write(float *to, int stride, int64_t first, vl some, Columns columns) {
+  for (int l = 0; l < WIDE; ++l)
+    for (int k = 0; k < stride && some[l]; ++k) to[stride * (first + l) + k] = static_cast<float>(columns.of[k][l]);
 }
 
 struct Outgoing {
@@ -126,36 +139,38 @@ void geometry_back(const Camera &camera, const Limits &lim, const Geometry &g, c
 void project_back(Frame &f, const SplatGrads &grads, int64_t begin, int64_t end, double *camera_part) {
   const Limits lim = limits(f.camera);
   const int sh_rows = f.splats.sh_rows;
-  for (int k = 0; k < 15; ++k) camera_part[k] = 0;
   const double unit = __builtin_sqrt(0.5 / LN2);  // p, r, s of a footprint are `unit` x those of the covariance
+  vd camera[15] = {};
   for (int64_t first = begin; first < end; first += WIDE) {
-    bool some[WIDE], any_at_all = false;
-    Incoming in{};
-    for (int l = 0; l < WIDE; ++l) {
+    vl some{};
+    bool any_at_all = false;
+    double sums[9][WIDE] = {}, toward[3][WIDE] = {}, factor[3][WIDE] = {};
+    for (int l = 0; l < WIDE && first + l < end; ++l) {
       const int64_t i = first + l;
-      some[l] = false;
-      if (i >= end) continue;
-      const Footprint &p = f.footprints.data[i];
-      double m[9], toward[3];
-      if (p.x0 == p.x1 || !gather(f, i, m)) {
+      double m[9], t[3];
+      if (f.rects.data[i].x0 == f.rects.data[i].x1 || !gather(f, i, m)) {
         zero(grads, i, sh_rows);
         continue;
       }
-      some[l] = any_at_all = true;
-      colour_back(f, i, m + 6, grads.sh + 3 * sh_rows * i, toward);
-      in.from_centre.x[l] = toward[0], in.from_centre.y[l] = toward[1], in.from_centre.z[l] = toward[2];
-      // log alpha = log opacity - ln 2 (u^2 + v^2), and the sums hold d, d u, d dy, d u dx, d u dy, d dy^2
-      in.opacity[l] = m[0];
-      in.p[l] = -2 * LN2 * unit * m[3];
-      in.r[l] = -2 * LN2 * unit * m[4];
-      in.s[l] = -2 * LN2 * unit * p.s * m[5];
-      in.x[l] = 2 * LN2 * p.p * m[1];
-      in.y[l] = 2 * LN2 * (p.r * m[1] + static_cast<double>(p.s) * p.s * m[2]);
-      grads.logits[i] = static_cast<float>(m[0] / (1 + exp(f.splats.logits[i])));
-      grads.means2d[2 * i] = static_cast<float>(in.x[l]);
-      grads.means2d[2 * i + 1] = static_cast<float>(in.y[l]);
+      const Footprint &p = f.footprints.data[i];
+      some[l] = -1, any_at_all = true;
+      colour_back(f, i, m + 6, grads.sh + 3 * sh_rows * i, t);
+      for (int k = 0; k < 6; ++k) sums[k][l] = m[k];
+      for (int k = 0; k < 3; ++k) toward[k][l] = t[k];
+      factor[0][l] = p.p, factor[1][l] = p.r, factor[2][l] = p.s;
     }
     if (!any_at_all) continue;
+    // log alpha = log opacity - ln 2 (u^2 + v^2), and the sums hold d, d u, d dy, d u dx, d u dy, d dy^2
+    const vd p = load_wide(factor[0]), r = load_wide(factor[1]), s = load_wide(factor[2]);
+    const vd du = load_wide(sums[1]), dy = load_wide(sums[2]);
+    Incoming in;
+    in.opacity = load_wide(sums[0]);
+    in.p = -2 * LN2 * unit * load_wide(sums[3]);
+    in.r = -2 * LN2 * unit * load_wide(sums[4]);
+    in.s = -2 * LN2 * unit * s * load_wide(sums[5]);
+    in.x = 2 * LN2 * p * du;
+    in.y = 2 * LN2 * (r * du + s * s * dy);
+    in.from_centre = {load_wide(toward[0]), load_wide(toward[1]), load_wide(toward[2])};
     Geometry g;
     V3 ga, gb;
     Outgoing out;
@@ -163,18 +178,17 @@ void project_back(Frame &f, const SplatGrads &grads, int64_t begin, int64_t end,
     footprint_of(f.camera, lim, f.splats, first, end, g);
     footprint_back(f, g, in, ga, gb);
     geometry_back(f.camera, lim, g, in, ga, gb, out);
-    for (int l = 0; l < WIDE; ++l) {
-      if (!some[l]) continue;
-      const int64_t i = first + l;
-      float *mean = grads.means + 3 * i, *scale = grads.log_scales + 3 * i, *quat = grads.quats + 4 * i;
-      mean[0] = float(out.mean.x[l]), mean[1] = float(out.mean.y[l]), mean[2] = float(out.mean.z[l]);
-      scale[0] = float(out.log_scale.x[l]), scale[1] = float(out.log_scale.y[l]), scale[2] = float(out.log_scale.z[l]);
-      quat[0] = float(out.qw[l]), quat[1] = float(out.qx[l]), quat[2] = float(out.qy[l]), quat[3] = float(out.qz[l]);
-      for (int k = 0; k < 12; ++k) camera_part[k] += out.camera[k][l];
-      camera_part[12] += in.from_centre.x[l], camera_part[13] += in.from_centre.y[l];
-      camera_part[14] += in.from_centre.z[l];
-    }
+    const vd logit = in.opacity / (1.0 + exp_lanes(column(f.splats.logits, 1, 0, first, end)));
+    const V3 scale = out.log_scale, mean = out.mean;
+    write(grads.means, 3, first, some, {{mean.x, mean.y, mean.z}});
+    write(grads.log_scales, 3, first, some, {{scale.x, scale.y, scale.z}});
+    write(grads.quats, 4, first, some, {{out.qw, out.qx, out.qy, out.qz}});
+    write(grads.logits, 1, first, some, {{logit}});
+    write(grads.means2d, 2, first, some, {{in.x, in.y}});
+    for (int k = 0; k < 12; ++k) camera[k] += some ? out.camera[k] : splat(0.0);
+    camera[12] += in.from_centre.x, camera[13] += in.from_centre.y, camera[14] += in.from_centre.z;
   }
+  for (int k = 0; k < 15; ++k) camera_part[k] = sum_lanes(camera[k]);
 }
 
 }  // namespace spikerig::SPIKERIG_ISA

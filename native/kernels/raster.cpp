@@ -11,6 +11,7 @@ namespace {
 constexpr int TALL = LANES / 4;              // pixel rows of a block
 constexpr int BLOCK_ROWS = TILE / TALL;      // block rows of a tile
 constexpr int BLOCKS = 4 * BLOCK_ROWS;
+constexpr int AHEAD = 6;                      // list entries whose footprint is fetched ahead
 constexpr float NEVER = -7.994353436858858f;  // log2(ALPHA_MIN)
 
 struct Offsets {
@@ -23,22 +24,40 @@ Offsets offsets() {
   return out;
 }
 
-// Blocks that a box of this reach around (x, y), both from the tile's corner, can meet; one bit a block, row by row.
-inline uint64_t blocks_met(float x, float y, float reach_x, float reach_y) {
-  float left = x - reach_x - 0.5f, right = x + reach_x - 0.5f, top = y - reach_y - 0.5f, bottom = y + reach_y - 0.5f;
-  if (!(right >= 0 && bottom >= 0 && left <= TILE - 1 && top <= TILE - 1)) return 0;
-  int x0 = left > 0 ? static_cast<int>(left) / 4 : 0, x1 = right < TILE - 1 ? static_cast<int>(right) / 4 : 3;
-  int y0 = top > 0 ? static_cast<int>(top) / TALL : 0;
-  int y1 = bottom < TILE - 1 ? static_cast<int>(bottom) / TALL : BLOCK_ROWS - 1;
-  uint64_t columns = (2u << x1) - (1u << x0);
-  uint64_t every_row = 0x1111111111111111u;
-  every_row = (every_row >> (60 - 4 * (y1 - y0))) << 4 * y0;
-  return columns * every_row;
-}
+constexpr int ROWS = BLOCK_ROWS < 8 ? BLOCK_ROWS : LANES;  // block rows looked at together
+typedef float rows_f __attribute__((vector_size(4 * ROWS)));
+typedef int32_t rows_i __attribute__((vector_size(4 * ROWS)));
 
-inline uint64_t slot_of(const Frame &f, int splat, int tx, int ty) {
-  const Footprint &p = f.footprints.data[splat];
-  return f.first_slot.data[splat] + static_cast<int64_t>(ty - p.y0) * (p.x1 - p.x0) + (tx - p.x0);
+// Blocks that the rim alpha = ALPHA_MIN around (x, y), from the tile's corner, can meet; one bit a block, row by row.
+// For each block row: the rim's furthest right and left over that row's pixel centres, then the blocks between.
+inline uint64_t blocks_met(const Footprint &s, float x, float y) {
+  const float room = s.room * 1.0001f + 1e-4f, shrink = 1.0f / s.p, ss = s.s * s.s;
+  const float lean = s.r < 0 ? -s.r : s.r, off = y < 0 ? -y : y;
+  const float slack = 1e-3f + 1e-6f * (3 + lean * (off + TILE)) * shrink;  // above the rounding of what follows
+  const rows_f zero{}, lean_r = zero + s.lean, lean_l = zero - s.lean, last = zero + (TILE - 1);
+  uint64_t out = 0;
+  for (int first = 0; first < BLOCK_ROWS; first += ROWS) {
+    rows_f top, wide_r, wide_l;
+    rows_i place;
+    for (int j = 0; j < ROWS; ++j) top[j] = TALL * (first + j) + 0.5f, place[j] = 4 * j;
+    top -= y;
+    const rows_f bottom = top + (TALL - 1);
+    const rows_f yr = lean_r < top ? top : lean_r > bottom ? bottom : lean_r;
+    const rows_f yl = lean_l < top ? top : lean_l > bottom ? bottom : lean_l;
+    const rows_f free_r = room - ss * yr * yr, free_l = room - ss * yl * yl;
+    for (int j = 0; j < ROWS; ++j) wide_r[j] = __builtin_sqrtf(free_r[j]), wide_l[j] = __builtin_sqrtf(free_l[j]);
+    const rows_f right = (wide_r - s.r * yr) * shrink + (x - 0.5f + slack);
+    const rows_f left = (-wide_l - s.r * yl) * shrink + (x + 0.5f - slack);  // + 1: truncation rounds it up
+    const rows_i from = __builtin_convertvector(left > zero ? left : zero, rows_i) >> 2;
+    const rows_i to = __builtin_convertvector(right < last ? right : last, rows_i) >> 2;
+    rows_i columns = (((rows_i{} + 2) << to) - ((rows_i{} + 1) << from));
+    columns &= (free_r >= zero) & (right >= zero) & (left < zero + TILE) & (from <= to);
+    columns <<= place;
+    uint32_t bits = 0;
+    for (int j = 0; j < ROWS; ++j) bits |= static_cast<uint32_t>(columns[j]);
+    out |= static_cast<uint64_t>(bits) << 4 * first;
+  }
+  return out;
 }
 
 // Copies of the picture's channels for a tile, block by block; lanes outside the picture are 0.
@@ -64,40 +83,49 @@ inline void each_pixel(const Frame &f, const Corner &c, Visit visit) {  // visit
 
 void raster_tile(Frame &f, int tile) {
   alignas(64) vf light[BLOCKS], red[BLOCKS], green[BLOCKS], blue[BLOCKS];
+  alignas(64) vi finished[BLOCKS];
   const Offsets at = offsets();
   const Corner c = corner(f, tile);
-  const int tx = tile % f.tiles_x, ty = tile / f.tiles_x;
-  for (int b = 0; b < BLOCKS; ++b) light[b] = red[b] = green[b] = blue[b] = vf{};
+  for (int b = 0; b < BLOCKS; ++b) light[b] = red[b] = green[b] = blue[b] = vf{}, finished[b] = vi{} + INT32_MAX;
   each_pixel(f, c, [&](int lane, int64_t) { reinterpret_cast<float *>(light)[lane] = 1.0f; });
   const vf never = splat(NEVER), least = splat(LIGHT_MIN), most = splat(ALPHA_MAX);
   uint64_t live = 0;
   for (int b = 0; b < BLOCKS; ++b) live |= static_cast<uint64_t>(any(at_least(light[b], least))) << b;
-  const int32_t *list = f.list.data;
-  const int64_t end = f.tile_start.data[tile + 1];
-  for (int64_t k = f.tile_start.data[tile]; k < end && live; ++k) {
-    if (k + 4 < end) __builtin_prefetch(&f.footprints.data[list[k + 4]]);
-    const Footprint &s = f.footprints.data[list[k]];
+  const Entry *list = f.list.data + f.tile_start.data[tile];
+  uint64_t *touched = f.touched.data + f.tile_start.data[tile];
+  const int count = static_cast<int>(f.tile_start.data[tile + 1] - f.tile_start.data[tile]);
+  int k = 0;
+  for (; k < count && live; ++k) {
+    if (k + AHEAD < count) __builtin_prefetch(&f.footprints.data[list[k + AHEAD].splat]);
+    const Footprint &s = f.footprints.data[list[k].splat];
     const float x = static_cast<float>(s.x - c.x), y = static_cast<float>(s.y - c.y);
-    uint64_t todo = blocks_met(x, y, s.reach_x, s.reach_y) & live, touched = 0;
+    uint64_t todo = blocks_met(s, x, y) & live, met = 0;
     for (; todo; todo &= todo - 1) {
       const int b = __builtin_ctzll(todo);
       const vf dx = at.x + (4 * (b % 4) - x), dy = at.y + (TALL * (b / 4) - y);
       const vf u = s.p * dx + s.r * dy, v = s.s * dy;
       const vf power = s.log2_opacity - v * v - u * u;
-      vf t = light[b];
-      const mask on = both(at_least(power, never), at_least(t, least));
+      const vf before = light[b];
+      const mask on = both(at_least(power, never), at_least(before, least));
       if (!any(on)) continue;
-      touched |= uint64_t{1} << b;
-      const vf w = keep(on, smaller(exp2_lanes(power), most)) * t;
-      t -= w;
-      light[b] = t;
+      met |= uint64_t{1} << b;
+      const vf alpha = keep(on, smaller(exp2_lanes(power), most)), w = alpha * before;
+      const vf after = before * (1.0f - alpha);
+      light[b] = after;
       red[b] += w * s.red;
       green[b] += w * s.green;
       blue[b] += w * s.blue;
-      if (!any(at_least(t, least))) live &= ~(uint64_t{1} << b);
+      const mask still = at_least(after, least), now = without(on, still);
+      if (!any(now)) continue;
+      finished[b] = choose(now, vi{} + k, finished[b]);
+      if (!any(still)) live &= ~(uint64_t{1} << b);
     }
-    f.touched.data[slot_of(f, list[k], tx, ty)] = touched;
+    touched[k] = met;
   }
+  for (; k < count; ++k) touched[k] = 0;  // the tile was finished before
+  const size_t lanes = static_cast<size_t>(tile) * TILE * TILE;
+  __builtin_memcpy(f.light.data + lanes, light, sizeof light);
+  __builtin_memcpy(f.finished.data + lanes, finished, sizeof finished);
   each_pixel(f, c, [&](int lane, int64_t pixel) {
     float t = reinterpret_cast<float *>(light)[lane], *out = f.image + 3 * pixel;
     out[0] = reinterpret_cast<float *>(red)[lane] + t * f.background[0];
@@ -107,31 +135,37 @@ void raster_tile(Frame &f, int tile) {
   });
 }
 
-// Front to back again, with the light T recomputed and what lies behind kept as one number a pixel: S starts at
-// <picture, gradient> and loses each splat's share, so d(loss)/d(alpha) = T <colour, gradient> - S / (1 - alpha).
+// Back to front: the light T is undone by 1 / (1 - alpha) >= 1, which is at most 100, and S, the loss's share of all
+// that lies behind, grows from small to large. So both keep their relative accuracy however deep the stack.
+// d(loss)/d(alpha) = T <colour, gradient> - S / (1 - alpha).
 void raster_tile_back(Frame &f, int tile) {
   alignas(64) vf light[BLOCKS], behind[BLOCKS], red[BLOCKS], green[BLOCKS], blue[BLOCKS];
+  alignas(64) vi finished[BLOCKS];
   const Offsets at = offsets();
   const Corner c = corner(f, tile);
-  const int tx = tile % f.tiles_x, ty = tile / f.tiles_x;
-  for (int b = 0; b < BLOCKS; ++b) light[b] = behind[b] = red[b] = green[b] = blue[b] = vf{};
+  const size_t lanes = static_cast<size_t>(tile) * TILE * TILE;
+  __builtin_memcpy(light, f.light.data + lanes, sizeof light);
+  __builtin_memcpy(finished, f.finished.data + lanes, sizeof finished);
+  for (int b = 0; b < BLOCKS; ++b) behind[b] = red[b] = green[b] = blue[b] = vf{};
   each_pixel(f, c, [&](int lane, int64_t pixel) {
-    const float *g = f.image_grad + 3 * pixel, *out = f.image + 3 * pixel;
-    reinterpret_cast<float *>(light)[lane] = 1.0f;
+    const float *g = f.image_grad + 3 * pixel, *end = f.background;
     reinterpret_cast<float *>(red)[lane] = g[0];
     reinterpret_cast<float *>(green)[lane] = g[1];
     reinterpret_cast<float *>(blue)[lane] = g[2];
-    reinterpret_cast<float *>(behind)[lane] = out[0] * g[0] + out[1] * g[1] + out[2] * g[2] - (1.0f - f.alpha[pixel]) * f.alpha_grad[pixel];
+    reinterpret_cast<float *>(behind)[lane] =
+        reinterpret_cast<float *>(light)[lane] * (g[0] * end[0] + g[1] * end[1] + g[2] * end[2] - f.alpha_grad[pixel]);
   });
-  const vf never = splat(NEVER), least = splat(LIGHT_MIN), most = splat(ALPHA_MAX);
-  const int32_t *list = f.list.data;
-  const int64_t end = f.tile_start.data[tile + 1];
-  for (int64_t k = f.tile_start.data[tile]; k < end; ++k) {
-    if (k + 4 < end) __builtin_prefetch(&f.footprints.data[list[k + 4]]);
-    const uint64_t slot = slot_of(f, list[k], tx, ty);
-    uint64_t todo = f.touched.data[slot];
+  const vf never = splat(NEVER), most = splat(ALPHA_MAX);
+  const Entry *list = f.list.data + f.tile_start.data[tile];
+  const uint64_t *touched = f.touched.data + f.tile_start.data[tile];
+  for (int k = static_cast<int>(f.tile_start.data[tile + 1] - f.tile_start.data[tile]) - 1; k >= 0; --k) {
+    if (k >= AHEAD && touched[k - AHEAD]) {
+      __builtin_prefetch(&f.footprints.data[list[k - AHEAD].splat]);
+      __builtin_prefetch(f.slots.data + static_cast<size_t>(list[k - AHEAD].slot) * SLOT, 1);
+    }
+    uint64_t todo = touched[k];
     if (!todo) continue;
-    const Footprint &s = f.footprints.data[list[k]];
+    const Footprint &s = f.footprints.data[list[k].splat];
     const float x = static_cast<float>(s.x - c.x), y = static_cast<float>(s.y - c.y);
     vf sum[9] = {};
     for (; todo; todo &= todo - 1) {
@@ -139,18 +173,17 @@ void raster_tile_back(Frame &f, int tile) {
       const vf dx = at.x + (4 * (b % 4) - x), dy = at.y + (TALL * (b / 4) - y);
       const vf u = s.p * dx + s.r * dy, v = s.s * dy;
       const vf power = s.log2_opacity - v * v - u * u;
-      const vf t = light[b];
-      const mask on = both(at_least(power, never), at_least(t, least));
+      const mask on = both(at_least(power, never), at_least(finished[b], vi{} + k));
       const vf free = exp2_lanes(power);
-      const vf alpha = keep(on, smaller(free, most)), w = alpha * t;
+      const vf alpha = keep(on, smaller(free, most)), undo = 1.0f / (1.0f - alpha);
+      const vf t = light[b] * undo, w = alpha * t, rest = behind[b];
       const vf shade = s.red * red[b] + s.green * green[b] + s.blue * blue[b];
-      const vf rest = behind[b] - w * shade;
-      light[b] = t - w;
-      behind[b] = rest;
+      light[b] = t;
+      behind[b] = rest + w * shade;
       sum[6] += w * red[b];
       sum[7] += w * green[b];
       sum[8] += w * blue[b];
-      const vf d = keep(at_least(most, free), alpha * (t * shade - rest / (1.0f - alpha)));  // d loss / d log alpha
+      const vf d = keep(at_least(most, free), alpha * (t * shade - rest * undo));  // d loss / d log alpha
       const vf du = d * u, dv = d * dy;
       sum[0] += d;
       sum[1] += du;
@@ -159,9 +192,8 @@ void raster_tile_back(Frame &f, int tile) {
       sum[4] += du * dy;
       sum[5] += dv * dy;
     }
-    float total[12];
-    sum_nine(sum, total);
-    __builtin_memcpy(f.slots.data + slot * SLOT, total, 9 * sizeof(float));
+    sum_nine(sum, f.slots.data + static_cast<size_t>(list[k].slot) * SLOT);
+    f.used.data[list[k].slot] = 1;
   }
 }
 

@@ -6,62 +6,73 @@
 namespace spikerig::SPIKERIG_ISA {
 namespace {
 
-constexpr int64_t NEAR = 512;  // bytes of a section of tfi_at
-constexpr int64_t ALL = 64;    // bytes of a section of tfi_all
+constexpr int64_t NEAR = 4096;  // bytes of a section of tfi_at: a page, read in order
+constexpr int64_t LINE = 64;    // bytes that leave the search together
+constexpr int64_t AHEAD = 8;    // ticks to prefetch
+constexpr int64_t ALL = 64;     // bytes of a section of tfi_all
 
-// Looks for each pixel's rank-th spike over ticks first, first + step, .. (n of them); words of 64 pixels leave the
-// list as soon as all of theirs are found, so bright pictures end after a few ticks.
+// Looks for each pixel's rank-th spike over ticks first, first + step, .. (n of them). Lines leave the list as soon
+// as all of their pixels are found, so bright pictures end after a few ticks.
 struct Search {
-  uint64_t open[NEAR / 8];      // pixels still looked for
-  uint16_t active[NEAR / 8];    // words with an open pixel
+  alignas(64) uint8_t open[NEAR];  // pixels still looked for
+  uint16_t active[NEAR / LINE];    // lines with an open pixel
   int32_t found[NEAR * 8];
   int32_t left[NEAR * 8];
 
   void start(Section at, int64_t width, int rank) {
     std::memset(open, 0, sizeof open);
     runs(at, width, [&](int64_t byte, int64_t, int64_t n) {
-      for (int64_t i = (byte - at.begin) * 8; n > 0;) {
-        const int64_t bit = i % 64, take = std::min<int64_t>(64 - bit, n);
-        open[i / 64] |= (take == 64 ? ~uint64_t{0} : (uint64_t{1} << take) - 1) << bit;
-        i += take;
-        n -= take;
-      }
+      uint8_t *to = open + (byte - at.begin);
+      std::memset(to, 255, static_cast<size_t>(n / 8));
+      if (n % 8) to[n / 8] = static_cast<uint8_t>((1 << (n % 8)) - 1);
     });
     std::fill(found, found + at.bytes() * 8, -1);
     if (rank > 1) std::fill(left, left + at.bytes() * 8, rank);
   }
 
-  void hit(int64_t word, uint64_t spikes, int32_t tick, int rank) {
-    for (uint64_t s = spikes; s; s &= s - 1) {
-      const int bit = __builtin_ctzll(s);
-      int64_t pixel = word * 64 + bit;
-      if (rank > 1 && --left[pixel] > 0) {
-        spikes &= ~(uint64_t{1} << bit);
-        continue;
+  // Takes the spikes of a line's open pixels, `lit` saying in which words some are; false when no pixel is left.
+  bool hit(int64_t line, uint64_t *spikes, uint32_t lit, int32_t tick, int rank) {
+    for (; lit; lit &= lit - 1) {
+      const int w = __builtin_ctz(lit);
+      const int64_t pixel = (line * LINE + w * 8) * 8;
+      if (rank > 1) {
+        for (uint64_t s = spikes[w]; s; s &= s - 1)
+          if (--left[pixel + __builtin_ctzll(s)] > 0) spikes[w] ^= s & -s;
       }
-      found[pixel] = tick;
+      put_where(found + pixel, spikes[w], tick);
     }
-    open[word] &= ~spikes;
+    alignas(64) uint64_t mine[LINE / 8];
+    std::memcpy(mine, open + line * LINE, LINE);
+    for (int64_t w = 0; w < LINE / 8; ++w) mine[w] &= ~spikes[w];
+    std::memcpy(open + line * LINE, mine, LINE);
+    return lit_words(mine) != 0;
   }
 
   void run(const Packed &s, Section at, int64_t first, int64_t n, int step, int rank) {
-    const int64_t words = (at.bytes() + 7) / 8, frame = s.frame(), last = at.bytes() - (words - 1) * 8;
+    const int64_t lines = (at.bytes() + LINE - 1) / LINE, frame = s.frame(), rest = at.bytes() % LINE;
     int64_t count = 0;
-    for (int64_t w = 0; w < words; ++w)
-      if (open[w]) active[count++] = static_cast<uint16_t>(w);
+    for (int64_t k = 0; k < lines; ++k) active[count++] = static_cast<uint16_t>(k);
+    alignas(64) uint8_t padded[LINE] = {};
     for (int64_t k = 0, tick = first; k < n && count; ++k, tick += step) {
       const uint8_t *row = s.bits + tick * frame + at.begin;
+      const int64_t ahead = k + AHEAD < n ? step * AHEAD * frame : 0;
       int64_t keep = 0;
       for (int64_t i = 0; i < count; ++i) {
-        const int64_t w = active[i];
-        uint64_t spikes = 0;
-        if (w == words - 1)
-          std::memcpy(&spikes, row + w * 8, static_cast<size_t>(last));
-        else
-          std::memcpy(&spikes, row + w * 8, 8);
-        if (spikes &= open[w]) hit(w, spikes, static_cast<int32_t>(tick), rank);
-        active[keep] = static_cast<uint16_t>(w);
-        keep += open[w] != 0;
+        const int64_t line = active[i];
+        const uint8_t *from = row + line * LINE;
+        __builtin_prefetch(from + ahead);
+        if (rest && line == lines - 1) {
+          std::memcpy(padded, from, static_cast<size_t>(rest));
+          from = padded;
+        }
+        alignas(64) uint64_t spikes[LINE / 8];
+        for (int64_t j = 0; j < LINE; j += WIDE) {
+          const Wide now = load_wide(from + j) & load_wide(open + line * LINE + j);
+          std::memcpy(reinterpret_cast<uint8_t *>(spikes) + j, &now, sizeof now);
+        }
+        const uint32_t lit = lit_words(spikes);
+        active[keep] = static_cast<uint16_t>(line);
+        keep += lit ? hit(line, spikes, lit, static_cast<int32_t>(tick), rank) : 1;
       }
       count = keep;
     }

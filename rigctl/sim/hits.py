@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.rigctl.sim.world import Box, Rect, Room, Solid, Sphere
 
-Floats = NDArray[np.float32]
-Axes = list[Floats]
+Floats = NDArray[np.floating]  # float32 unless said
+Axes = Sequence[Floats | np.floating]  # a vector, axis by axis
 NEAR = np.float32(1e-3)
 TINY = np.float32(1e-30)  # keeps a ray along an axis from dividing by zero; lost in the rounding of any other
 
@@ -20,7 +22,7 @@ def vec3(v: NDArray[np.float64]) -> tuple[float, float, float]:
 
 def dot3(a: Axes, b: Axes) -> Floats:
     """a . b of vectors given axis by axis."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def dot(p: Axes, axis: tuple[float, float, float]) -> Floats:
@@ -29,7 +31,7 @@ def dot(p: Axes, axis: tuple[float, float, float]) -> Floats:
     total = terms[0]
     for term in terms[1:]:
         total = total + term
-    return total
+    return np.asarray(total)
 
 
 def screen(
@@ -72,18 +74,15 @@ def _hit_room(room: Room, first: int, o: Axes, d: Axes, depth: Floats, face: NDA
 
 def _hit_box(box: Box, first: int, o: Axes, d: Axes, depth: Floats, face: NDArray[np.int16]) -> None:
     o, d = box_frame(box, [o[a] - np.float32(box.centre[a]) for a in range(3)], d)
-    enter, leave, side = None, None, None
+    enter, leave, side = np.float32(-np.inf), np.float32(np.inf), np.int16(0)
     for axis in range(3):
         inv = 1 / d[axis]
         half = np.float32(box.size[axis] / 2) * np.abs(inv)
         mid = -o[axis] * inv
         a, b = mid - half, mid + half
         low = (d[axis] < 0) + np.int16(first + 2 * axis)  # moving up the axis it enters by the low side
-        if enter is None:
-            enter, leave, side = a, b, low
-        else:
-            side = np.where(a > enter, low, side)
-            enter, leave = np.maximum(enter, a), np.minimum(leave, b)
+        side = np.where(a > enter, low, side)
+        enter, leave = np.maximum(enter, a), np.minimum(leave, b)
     hit = (enter < leave) & (enter > NEAR) & (enter < depth)
     np.copyto(depth, enter, where=hit)
     np.copyto(face, side, where=hit)

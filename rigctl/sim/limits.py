@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
-from spikerig.dataset.errors import UsageError
+from spikerig.dataset.errors import RigError, UsageError
 
 R = TypeVar("R")
 VECTORS = {"Vec3": "tuple[float, float, float]"}  # annotations are text here, so aliases are told by name
@@ -29,30 +29,42 @@ def limits(
 
 
 class Faults:
-    """Faults found so far, each with the path of the key; `raise_any` tells them all in one error."""
+    """Faults found so far, each with the path of the key; `raise_any` tells them all in one error.
 
-    def __init__(self, source: str) -> None:
-        self.source = source
+    Args:
+        source: what is faulty, for the first line.
+        kind: of the error.
+        next: what to do.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        kind: type[RigError] = UsageError,
+        next: str = "the keys, their units and ranges are in docs/scenes.md",
+    ) -> None:
+        self.source, self.kind, self.next = source, kind, next
         self.found: list[str] = []
 
     def add(self, where: str, message: str) -> None:
         """Note one fault at a dotted path."""
         self.found.append(f"{where}: {message}" if where else message)
 
+    def unknown(self, where: str, name: str, known: Iterable[str]) -> None:
+        """Note a name that is not among those known, with the nearest one."""
+        self.add(where, f"unknown key; {nearest(name, known)}")
+
     def raise_any(self) -> None:
-        """Raise a UsageError that lists every fault; nothing when there is none."""
+        """Raise an error that lists every fault; nothing when there is none."""
         if not self.found:
             return
         count = "a fault" if len(self.found) == 1 else f"{len(self.found)} faults"
-        raise UsageError(
-            f"{self.source} has {count}",
-            value="\n            ".join(self.found),
-            next="the keys and their ranges are in docs/scenes.md",
-        )
+        shown = self.found[:50] + ([f"... and {len(self.found) - 50} more"] if len(self.found) > 50 else [])
+        raise self.kind(f"{self.source} has {count}", value="\n            ".join(shown), next=self.next)
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """The words `; did you mean 'x'?` for the closest known name, or the list of names when none is close."""
+    """The words `did you mean 'x'?` for the closest known name, or the list of names when none is close."""
     names = sorted(known)
     close = difflib.get_close_matches(name, names, 1, 0.5)
     return f"did you mean '{close[0]}'?" if close else f"known: {', '.join(names)}"
@@ -77,7 +89,7 @@ def read_record(cls: type[R], table: Any, where: str, faults: Faults, defaults: 
         table = {}
     for key in table:
         if key not in fields:
-            faults.add(f"{where}.{key}".strip("."), f"unknown key; {nearest(key, fields)}")
+            faults.unknown(f"{where}.{key}".strip("."), str(key), fields)
     values: dict[str, Any] = {}
     for name, spec in fields.items():
         path = f"{where}.{name}".strip(".")
@@ -121,7 +133,6 @@ def _checked(value: Any, spec: dataclasses.Field, path: str, faults: Faults) -> 
         good = isinstance(value, int) and not isinstance(value, bool)
     elif kind == "float":
         good = _is_number(value)
-        value = float(value) if good else value
     elif kind == "str":
         good = isinstance(value, str)
     else:
@@ -132,12 +143,12 @@ def _checked(value: Any, spec: dataclasses.Field, path: str, faults: Faults) -> 
         return fallback
     choices = spec.metadata.get("choices") or ()
     if choices and value not in choices:
-        faults.add(path, f"is {value!r}; {nearest(value, choices)}{_range(spec)}")
+        faults.add(path, f"is {value!r}; {nearest(str(value), choices)}{_range(spec)}")
         return fallback
     if kind in ("int", "float") and not _inside(value, spec):
         faults.add(path, f"is {value!r}{_range(spec)}")
         return fallback
-    return value
+    return float(value) if kind == "float" else value
 
 
 def _is_number(value: Any) -> bool:
@@ -145,4 +156,4 @@ def _is_number(value: Any) -> bool:
 
 
 def _inside(value: float, spec: dataclasses.Field) -> bool:
-    return math.isfinite(value) and spec.metadata.get("lo", -math.inf) <= value <= spec.metadata.get("hi", math.inf)
+    return spec.metadata.get("lo", -math.inf) <= value <= spec.metadata.get("hi", math.inf) and math.isfinite(value)

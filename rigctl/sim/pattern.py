@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from spikerig.rigctl.sim.limits import limits
 
-Floats = NDArray[np.float32]
+Floats = NDArray[np.floating]  # float32 unless said
 KINDS = ("plain", "tiles", "checker", "stripes", "noise", "star", "edge")
 CELLS = 64  # tiles and noise repeat after this many cells
 

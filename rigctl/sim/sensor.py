@@ -14,7 +14,7 @@ from spikerig.dataset.kernels import fire
 from spikerig.rigctl.sim.effects import Hooks
 from spikerig.rigctl.sim.spec import Sensor
 
-Floats = NDArray[np.float32]
+Floats = NDArray[np.floating]  # float32 unless said
 BLOCK = 300_000  # pixel-ticks of light made at once where an effect needs every tick
 
 

@@ -45,7 +45,7 @@ class Face:
         r = np.float32(self.radius)
         return np.arctan2(q[1], q[0]) * r, np.arcsin(np.clip(q[2] / r, -1, 1)) * r
 
-    def place(self, u: NDArray[np.float64], v: NDArray[np.float64], flip: bool) -> tuple[Axes, Axes]:
+    def place(self, u: Floats, v: Floats, flip: bool) -> tuple[Axes, Axes]:
         """Points and unit normals at coordinates; the other side's normals where `flip`. The inverse of the above."""
         c = np.array(self.centre)[:, None]
         if self.normal is None:
@@ -188,13 +188,13 @@ def _shadowed(solid: Sphere | Box, away: Axes, to: Axes, r2: Floats) -> NDArray[
         return (b < 0) & (-b < r2) & (c > 0) & (b * b > r2 * c)
     with np.errstate(divide="ignore", invalid="ignore"):
         o, d = box_frame(solid, away, to)
-        enter, leave = None, None
+        enter, leave = np.float32(-np.inf), np.float32(np.inf)
         for axis in range(3):
             inv = 1 / d[axis]
             half, mid = np.float32(solid.size[axis] / 2) * np.abs(inv), -o[axis] * inv
-            enter = mid - half if enter is None else np.maximum(enter, mid - half)
-            leave = mid + half if leave is None else np.minimum(leave, mid + half)
-        return (enter < leave) & (enter > NEAR) & (enter < 1)
+            enter = np.maximum(enter, mid - half)
+            leave = np.minimum(leave, mid + half)
+        return np.asarray((enter < leave) & (enter > NEAR) & (enter < 1))
 
 
 def _contact(solid: Sphere | Box, away: Axes, n: Axes) -> Floats:

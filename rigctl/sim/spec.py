@@ -10,10 +10,13 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from spikerig.dataset.errors import UsageError
 from spikerig.rigctl.sim.effects import Effect, read_effects
 from spikerig.rigctl.sim.limits import Faults, limits, nearest, read_record
-from spikerig.rigctl.sim.world import Vec3, World, read_world
+from spikerig.rigctl.sim.orbit import Orbit, orbit_pose
+from spikerig.rigctl.sim.world import Vec3, World, read_world, stands_in
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,30 +30,6 @@ class Lens:
 
 
 @dataclass(frozen=True, slots=True)
-class Orbit:
-    """`[orbit]`: viewpoints on an arc around the vertical through `target`, all looking at it.
-
-    `views` are spread evenly from `start_deg` over `arc_deg`, ends included. Every `test_every`-th (the third of five)
-    is for testing, unless `test` lists them by number from 0.
-    """
-
-    views: int = limits(30, 1, 100_000)
-    start_deg: float = limits(0.0, -3600, 3600, "degrees")
-    arc_deg: float = limits(174.0, -3600, 3600, "degrees")
-    radius: float = limits(2.0, 1e-3, 1e6, "world units")
-    height: float = limits(1.0, -1e6, 1e6, "world units")
-    target: Vec3 = limits((0.0, 0.0, 0.0), -1e6, 1e6, "world units")
-    test_every: int = limits(5, 0, 100_000, "views; 0 for no test views")
-    test: tuple[float, ...] = limits((), 0, 100_000, "view numbers")
-
-    def held_out(self) -> frozenset[int]:
-        """Numbers of the views for testing."""
-        if self.test:
-            return frozenset(int(k) for k in self.test)
-        return frozenset(range(self.test_every // 2, self.views, self.test_every) if self.test_every else ())
-
-
-@dataclass(frozen=True, slots=True)
 class Shake:
     """`[shake]`: hand shake over one exposure, a cubic spline of rotation and translation.
 
@@ -61,7 +40,7 @@ class Shake:
         roll: turning about the optical axis beside turning across it.
     """
 
-    path_px: tuple[float, float] = limits((6.0, 11.0), 0, 1e4, "px")
+    path_px: tuple[float, float] = limits((6.0, 11.0), 0, 1000, "px")
     curvature: float = limits(0.35, 0, 10)
     translation: float = limits(0.2, 0, 1)
     roll: float = limits(0.3, 0, 10)
@@ -129,6 +108,18 @@ class Cloud:
 
 
 @dataclass(frozen=True, slots=True)
+class Settings:
+    """The part of a scene file that does not say where the light comes from."""
+
+    name: str
+    seed: int
+    exposure: Exposure
+    sensor: Sensor
+    cloud: Cloud
+    effects: tuple[Effect, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class SceneSpec:
     """A whole scene file."""
 
@@ -149,12 +140,16 @@ class _Top:
     name: str = limits("")
     seed: int = limits(0, 0, 2**32 - 1)
     effects: Any = limits(())
-    camera: Any = limits({})
-    orbit: Any = limits({})
-    shake: Any = limits({})
     exposure: Any = limits({})
     sensor: Any = limits({})
     points: Any = limits({})
+
+
+@dataclass(frozen=True, slots=True)
+class _TopScene(_Top):
+    camera: Any = limits({})
+    orbit: Any = limits({})
+    shake: Any = limits({})
     world: Any = limits({})
 
 
@@ -191,54 +186,76 @@ def load_scene_toml(path_or_name: str | Path) -> SceneSpec:
     return read_scene(table, text_name)
 
 
+def read_settings(table: Mapping[str, Any], source: str) -> Settings:
+    """Settings from a parsed TOML table: name, seed, exposure, sensor, points, effects; faults as `load_scene_toml`."""
+    faults = Faults(source)
+    settings = _settings(read_record(_Top, table, "", faults), faults)
+    faults.raise_any()
+    return settings
+
+
+def _settings(top: _Top, faults: Faults) -> Settings:
+    paper = isinstance(top.exposure, Mapping) and top.exposure.get("protocol") == "paper"
+    exposure = read_record(Exposure, top.exposure, "exposure", faults, PAPER if paper else None)
+    sensor = read_record(Sensor, top.sensor, "sensor", faults, {"gain": 0.5} if paper else None)
+    cloud = read_record(Cloud, top.points, "points", faults)
+    effects = read_effects(top.effects, exposure.phase, faults)
+    _check_exposure(exposure, faults)
+    if sum(sensor.response) <= 0:
+        faults.add("sensor.response", "is all zero: the spike camera would be blind")
+    return Settings(top.name, top.seed, exposure, sensor, cloud, effects)
+
+
+def _check_exposure(exposure: Exposure, faults: Faults) -> None:
+    ticks = exposure.exposure_ms * 1e-3 * exposure.rate_hz
+    if ticks < 0.5 or abs(ticks - round(ticks)) > 1e-6 * ticks:
+        faults.add("exposure.exposure_ms", f"x rate_hz is {ticks:g} ticks, expected a whole number, at least 1")
+    span_ms = exposure.exposure_ms + 2e3 * exposure.margin_ticks / exposure.rate_hz
+    if exposure.period_ms < span_ms:
+        faults.add("exposure.period_ms", f"is {exposure.period_ms:g}, less than exposure and margins, {span_ms:g} ms")
+
+
 def read_scene(table: Mapping[str, Any], source: str = "the scene") -> SceneSpec:
     """A scene from a parsed TOML table; see `load_scene_toml`."""
     faults = Faults(source)
-    top = read_record(_Top, table, "", faults)
-    raw_exposure = top.exposure if isinstance(top.exposure, Mapping) else {}
-    paper = raw_exposure.get("protocol") == "paper"
-    exposure = read_record(Exposure, top.exposure, "exposure", faults, PAPER if paper else None)
+    top = read_record(_TopScene, table, "", faults)
+    settings = _settings(top, faults)
     spec = SceneSpec(
         name=top.name or Path(source).stem,
         seed=top.seed,
         lens=read_record(Lens, top.camera, "camera", faults),
         orbit=read_record(Orbit, top.orbit, "orbit", faults),
         shake=read_record(Shake, top.shake, "shake", faults),
-        exposure=exposure,
-        sensor=read_record(Sensor, top.sensor, "sensor", faults, {"gain": 0.5} if paper else None),
-        cloud=read_record(Cloud, top.points, "points", faults),
+        exposure=settings.exposure,
+        sensor=settings.sensor,
+        cloud=settings.cloud,
         world=read_world(top.world, faults),
-        effects=read_effects(top.effects, exposure.phase, faults),
+        effects=settings.effects,
     )
-    _cross_check(spec, faults)
+    if not faults.found:
+        _check_views(spec, faults)
     faults.raise_any()
     return spec
 
 
-def _cross_check(spec: SceneSpec, faults: Faults) -> None:
-    """Faults that need more than one key to see."""
-    exposure, orbit = spec.exposure, spec.orbit
-    ticks = exposure.exposure_ms * 1e-3 * exposure.rate_hz
-    if ticks < 0.5 or abs(ticks - round(ticks)) > 1e-6 * ticks:
-        faults.add("exposure.exposure_ms", f"x rate_hz is {ticks:g} ticks, expected a whole number, at least 1")
-    elif exposure.sub_poses > exposure.ticks + (exposure.light == "linear"):
-        faults.add(
-            "exposure.sub_poses", f"is {exposure.sub_poses}, more than the {exposure.ticks} ticks of an exposure"
-        )
-    span_ms = exposure.exposure_ms + 2e3 * exposure.margin_ticks / exposure.rate_hz
-    if exposure.period_ms < span_ms:
-        faults.add("exposure.period_ms", f"is {exposure.period_ms:g}, less than exposure and margins, {span_ms:g} ms")
+def _check_views(spec: SceneSpec, faults: Faults) -> None:
+    """Faults that need more than one table to see."""
+    orbit, n = spec.orbit, spec.exposure.sub_poses
+    if n > spec.exposure.ticks + (spec.exposure.light == "linear"):
+        faults.add("exposure.sub_poses", f"is {n}, more than fit the {spec.exposure.ticks} ticks of an exposure")
     if spec.shake.path_px[0] > spec.shake.path_px[1]:
         faults.add("shake.path_px", f"is {list(spec.shake.path_px)}, expected [low, high]")
     for k in orbit.test:
         if k != int(k) or k >= orbit.views:
             faults.add("orbit.test", f"holds {k:g}, expected view numbers 0 to {orbit.views - 1}")
-    if sum(spec.sensor.response) <= 0:
-        faults.add("sensor.response", "is all zero: the spike camera would be blind")
     if len(orbit.held_out()) >= orbit.views:
         faults.add("orbit.test_every", "leaves no view to train on")
-    if orbit.radius == 0 or not spec.world.solids:
-        faults.add("world.solids", "is empty: nothing to look at")
+    for number in sorted({round(k) for k in np.linspace(0, orbit.views - 1, 64)}):
+        pose = orbit_pose(orbit, number)
+        trouble = stands_in(spec.world, -pose[:, :3].T @ pose[:, 3])
+        if trouble:
+            faults.add("orbit", f"view {number} stands {trouble}")
+            return
 
 
 def with_changes(spec: SceneSpec, *, seed: int | None = None, views: int | None = None) -> SceneSpec:
@@ -252,6 +269,6 @@ def with_changes(spec: SceneSpec, *, seed: int | None = None, views: int | None 
             raise UsageError("too few or too many views", value=views, expected="1 to 100000")
         spec = dataclasses.replace(spec, orbit=dataclasses.replace(spec.orbit, views=views))
         faults = Faults("--views")
-        _cross_check(spec, faults)
+        _check_views(spec, faults)
         faults.raise_any()
     return spec

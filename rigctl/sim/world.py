@@ -10,12 +10,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spikerig.rigctl.sim.limits import Faults, limits, nearest, read_record
 from spikerig.rigctl.sim.pattern import Texture
 
 Vec3 = tuple[float, float, float]
 FAR = 1e6
+MAX_SOLIDS = 5000
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +99,16 @@ class World:
 
 
 @dataclass(frozen=True, slots=True)
-class _Air:
+class Air:
+    """`[world]`: light from everywhere, and what there is.
+
+    Args:
+        ambient: light that comes from everywhere (r, g, b).
+        contact: how much boxes and spheres darken the ambient light beside them, 0 to 1.
+        sky: light where a ray hits nothing.
+        lamp, solids: see below.
+    """
+
     ambient: Vec3 = limits((0.5, 0.5, 0.5), 0, 1e9)
     contact: float = limits(0.6, 0, 1)
     sky: Vec3 = limits((0.0, 0.0, 0.0), 0, 1e9)
@@ -107,12 +118,14 @@ class _Air:
 
 def read_world(table: Any, faults: Faults) -> World:
     """A world from the `[world]` table of a scene file; faults are noted, not raised."""
-    air = read_record(_Air, table, "world", faults)
+    air = read_record(Air, table, "world", faults)
     lamp = read_record(Lamp, air.lamp, "world.lamp", faults)
     rows = air.solids if air.solids != {} else []
     if not isinstance(rows, list):
         faults.add("world.solids", "is not a list; write [[world.solids]]")
         rows = []
+    if not 1 <= len(rows) <= MAX_SOLIDS:
+        faults.add("world.solids", f"are {len(rows)}, expected 1 to {MAX_SOLIDS}")
     found = [_read_solid(row, f"world.solids[{k}]", faults) for k, row in enumerate(rows)]
     return World(tuple(s for s in found if s is not None), lamp, air.ambient, air.contact, air.sky)
 
@@ -146,3 +159,18 @@ def _read_solid(row: Any, where: str, faults: Faults) -> Solid | None:
         if scale == 0 or abs(right @ up) > 1e-6 * scale:
             faults.add(f"{where}.up", "and right must be perpendicular and not zero")
     return solid
+
+
+def stands_in(world: World, at: NDArray[np.float64]) -> str:
+    """What is wrong with a camera standing at a point: in words, empty when nothing is."""
+    for k, solid in enumerate(world.solids):
+        if isinstance(solid, Room) and not (np.all(at > solid.lo) and np.all(at < solid.hi)):
+            return f"outside world.solids[{k}], the room"
+        if isinstance(solid, Sphere) and np.linalg.norm(at - solid.centre) <= solid.radius:
+            return f"inside world.solids[{k}], a sphere"
+        if isinstance(solid, Box):
+            c, s = np.cos(np.radians(solid.yaw_deg)), np.sin(np.radians(solid.yaw_deg))
+            q = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ (at - solid.centre)
+            if np.all(np.abs(q) <= np.array(solid.size) / 2):
+                return f"inside world.solids[{k}], a box"
+    return ""

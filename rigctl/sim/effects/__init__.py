@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from spikerig.rigctl.sim.draws import stream
 from spikerig.rigctl.sim.limits import Faults, nearest, read_record
 
-Floats = NDArray[np.float32]
+Floats = NDArray[np.floating]  # float32 unless said
 
 
 class Stage(IntEnum):

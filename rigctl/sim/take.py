@@ -1,0 +1,253 @@
+"""One view as both sensors took it, and the scene file that gathers them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from math import fsum
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spikerig.dataset.clocktime import ClockModel
+from spikerig.dataset.errors import HostError
+from spikerig.dataset.kernels import count
+from spikerig.dataset.scene import Camera, Frame, Points, Pose, Trajectory, Truth, View
+from spikerig.rigctl.sim.draws import stream
+from spikerig.rigctl.sim.effects import Effect, parameters
+from spikerig.rigctl.sim.schedule import Schedule, Track, phase_ns, start_ns
+from spikerig.rigctl.sim.sensor import Light, encode
+from spikerig.rigctl.sim.simulate import simulate
+from spikerig.rigctl.sim.spec import Cloud, Exposure, Sensor
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """What stays the same from view to view: the two sensors, their timing and their faults.
+
+    Args:
+        name, seed: of the scene.
+        camera: the one pinhole of both sensors.
+        exposure, sensor, effects: as in the scene file.
+    """
+
+    name: str
+    seed: int
+    camera: Camera
+    exposure: Exposure
+    sensor: Sensor
+    effects: tuple[Effect, ...]
+
+    @property
+    def light_gain(self) -> float:
+        """Spikes a tick at RGB white."""
+        return self.sensor.gain * fsum(self.sensor.response)
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """One captured view, its truth, its surface points, and what to report of it."""
+
+    view: View
+    light: NDArray[np.float32]
+    at_ns: int
+    trajectory: Trajectory
+    points: Points
+    blur_db: float
+    spikes_mean: float
+    spikes_max: int
+
+
+NO_POINTS = Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), "simulator")
+
+
+def take_sharp(rig: Rig, number: int, name: str, plan: Schedule, sharp: NDArray[np.float32], track: Track) -> Taken:
+    """A view for testing: the sharp picture at the label, no spikes.
+
+    Args:
+        rig: the sensors.
+        number, name: of the view.
+        plan: its schedule.
+        sharp: linear light float32[H,W,3] at the label.
+        track: where the camera was.
+    """
+    view, at_ns, path = _labelled(rig, number, name, plan, track, "test")
+    frame = Frame(encode(sharp), start_ns=at_ns)
+    return Taken(replace(view, frame=frame), sharp, at_ns, path, NO_POINTS, np.nan, 0.0, 0)
+
+
+def take_blurry(
+    rig: Rig,
+    number: int,
+    name: str,
+    plan: Schedule,
+    sharp: NDArray[np.float32],
+    track: Track,
+    rgb: NDArray[np.float32],
+) -> Taken:
+    """A view for training: spikes over exposure and margins, and the blurry picture.
+
+    Args:
+        rig, number, name, plan, sharp, track: as for `take_sharp`.
+        rgb: linear light float32[K,H,W,3] at `plan.phases`.
+    """
+    exposure = rig.exposure
+    view, at_ns, path = _labelled(rig, number, name, plan, track, "train")
+    first = int(plan.knots[0])
+    t0_ns = start_ns(exposure, number) + round(first * exposure.tick_ns)
+    light = Light(rgb, plan.knots - first, (-first, exposure.ticks - first), exposure.rate_hz, t0_ns)
+    seen = simulate(light, rig.sensor, rig.effects, rig.seed, number)
+    error = seen.frame.pixels.astype(np.float64) - encode(sharp)
+    counts = count(seen.spikes.bits, rig.camera.width, -first, exposure.ticks - first)
+    blur_db = 20 * np.log10(255 / max(float(np.sqrt(np.mean(error**2))), 1e-9))
+    view = replace(view, frame=seen.frame, spikes=seen.spikes, trajectory=path)
+    return Taken(view, sharp, at_ns, path, NO_POINTS, blur_db, float(counts.mean()), int(counts.max()))
+
+
+def _labelled(
+    rig: Rig, number: int, name: str, plan: Schedule, track: Track, split: Any
+) -> tuple[View, int, Trajectory]:
+    """A view without its picture yet, the instant of its label, its path."""
+    height, width = rig.camera.height, rig.camera.width
+    begin = start_ns(rig.exposure, number)
+    path = Trajectory(begin + phase_ns(rig.exposure, track.phases), track.poses)
+    pose = Pose(track.poses[int(np.searchsorted(track.phases, plan.label))])
+    rows = np.repeat(np.arange(height, dtype=np.float32)[:, None], width, 1)
+    frame = Frame(np.zeros((height, width, 3), np.uint8))
+    view = View(name, frame, None, rows, np.ones((height, width), bool), pose, None, split)
+    return view, begin + int(phase_ns(rig.exposure, plan.label)), path
+
+
+def surface(rig: Rig, number: int, cloud: Cloud, share: int, view: View, depth: NDArray[np.floating]) -> Points:
+    """A view's share of the surface points: random pixels, depth with noise, colours of the blurry picture.
+
+    Args:
+        rig: for camera and seed.
+        number: of the view.
+        cloud: relative depth noise.
+        share: how many points at most.
+        view: its picture and pose.
+        depth: along z at the label through the pixel centres, [H,W]; not finite or <= 0 where nothing is.
+    """
+    rng, camera, pose = stream(rig.seed, "points", number), rig.camera, view.pose.cam_from_world
+    flat = np.asarray(depth, np.float64).reshape(-1)
+    picked = rng.permutation(np.flatnonzero(np.isfinite(flat) & (flat > 0)))[:share]
+    z = flat[picked] * (1 + cloud.depth_noise * rng.standard_normal(len(picked)))
+    y, x = np.divmod(picked, camera.width)
+    K = camera.K
+    rays = np.stack([(x + 0.5 - K[0, 2]) / K[0, 0], (y + 0.5 - K[1, 2]) / K[1, 1], np.ones(len(picked))], 1)
+    return Points((rays * z[:, None] - pose[:, 3]) @ pose[:, :3], view.frame.pixels.reshape(-1, 3)[picked], "simulator")
+
+
+def share_of(total: int, rank: int, views: int) -> int:
+    """How many of `total` points the view of that rank gives; the shares sum to the total."""
+    return total * (rank + 1) // views - total * rank // views
+
+
+def in_parallel(work: Callable[[Any, int], T], job: Any, count_: int, workers: int) -> Iterator[T]:
+    """work(job, 0), work(job, 1), ... in order, by several processes; few are made ahead of what is taken.
+
+    Args:
+        work: a function of a module, for it runs in fresh processes.
+        job: passed to each.
+        count_: how many.
+        workers: processes; 1 works in this one.
+
+    Raises:
+        HostError: a worker process died.
+    """
+    if min(workers, count_) <= 1:
+        yield from (work(job, number) for number in range(count_))
+        return
+    pool = ProcessPoolExecutor(min(workers, count_), mp_context=get_context("spawn"))
+    try:
+        waiting: deque[Future[T]] = deque()
+        for number in range(count_):
+            waiting.append(pool.submit(work, job, number))
+            if len(waiting) > 2 * workers:  # bounded memory
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    except BrokenProcessPool as error:
+        raise HostError(
+            "a worker process died", cause="out of memory, or killed", next="give --workers 1, or a smaller picture"
+        ) from error
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def pack(
+    path: str | Path,
+    rig: Rig,
+    takes: Iterable[Taken],
+    *,
+    info: Mapping[str, Any],
+    points: Points | None = None,
+    force: bool = False,
+    done: Callable[[Taken], None] = lambda taken: None,
+) -> dict[str, Any]:
+    """Write views into a scene file as they come.
+
+    Args:
+        path: of the file; it appears there complete or not at all, and nothing is left beside it unless killed.
+        rig: what took them.
+        takes: in order.
+        info: provenance.
+        points: instead of those of the views.
+        force: replace an existing file.
+        done: called after each view is written.
+
+    Returns:
+        What was made, JSON-ready.
+
+    Raises:
+        UsageError: the file exists. HostError: the disk is full.
+    """
+    from spikerig.dataset.store import SceneWriter
+
+    effects = {effect.name: parameters(effect) for effect in rig.effects}
+    truth = Truth({}, {}, {}, ClockModel.identity(), effects, rig.seed, rig.exposure.label)
+    told: list[Taken] = []
+    with SceneWriter(path, rig.name, rig.camera, light_gain=rig.light_gain, info=info, truth=truth, force=force) as out:
+        try:
+            for taken in takes:
+                out.add(taken.view, light=taken.light, at_ns=taken.at_ns, trajectory=taken.trajectory)
+                told.append(replace(taken, view=replace(taken.view, spikes=None)))
+                done(taken)
+        except BaseException:
+            out.abort(keep=False)  # it can be made again
+            raise
+        if points is None:
+            xyz, rgb = (np.concatenate([getattr(t.points, key) for t in told]) for key in ("xyz", "rgb"))
+            points = Points(xyz, rgb, "simulator")
+        out.points = points if len(points.xyz) else None
+    return _report(rig, told, len(points.xyz)) | {"effects": effects}
+
+
+def _report(rig: Rig, told: list[Taken], points: int) -> dict[str, Any]:
+    train = [t for t in told if t.view.split == "train"]
+    exposure = rig.exposure
+    return {
+        "scene": rig.name,
+        "seed": rig.seed,
+        "train_views": len(train),
+        "test_views": len(told) - len(train),
+        "size": [rig.camera.width, rig.camera.height],
+        "ticks": exposure.ticks,
+        "rate_hz": exposure.rate_hz,
+        "protocol": exposure.protocol,
+        "pose_label": exposure.label,
+        "light_gain": rig.light_gain,
+        "points": points,
+        "spikes_mean": float(np.mean([t.spikes_mean for t in train])) if train else 0.0,
+        "spikes_max": max((t.spikes_max for t in train), default=0),
+        "blurry_psnr_db": float(np.mean([t.blur_db for t in train])) if train else None,
+    }
