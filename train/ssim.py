@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch.autograd.function import once_differentiable
 
 from spikerig.dataset.errors import UsageError
 
@@ -20,6 +21,7 @@ class _L1Ssim(torch.autograd.Function):
         return torch.tensor(loss, dtype=torch.float32)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, grad: torch.Tensor) -> Any:  # type: ignore[override]
         return torch.from_numpy(ctx.grad) * grad, None, None, None
 
