@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -118,6 +118,36 @@ def read_image(path: str | Path, *, nonfinite: str = "error") -> NDArray[Any]:
         return pixels[:, :, None]
     order = [2, 1, 0, 3][: pixels.shape[2]]
     return np.ascontiguousarray(pixels[:, :, order])
+
+
+class Head(NamedTuple):
+    """What a picture says of itself before its pixels are read."""
+
+    width: int
+    height: int
+    alpha: bool
+
+
+def image_head(path: str | Path) -> Head:
+    """Size of a picture and whether it has alpha; of a PNG or EXR only the head is read.
+
+    Raises:
+        DataError: not a picture, damaged, or too large.
+    """
+    source = Path(path)
+    start = _start(source)
+    if start.startswith(_PNG_START):
+        with source.open("rb") as file:
+            head = file.read(26)
+        width, height = int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
+        _check_size(source, width, height)
+        return Head(width, height, head[25:] in (b"\4", b"\6"))
+    if start.startswith(_EXR_START):
+        first = _exr_heads(source)[0]
+        (x0, y0), (x1, y1) = np.asarray(first["displayWindow"], np.int64).tolist()
+        return Head(x1 - x0 + 1, y1 - y0 + 1, any(channel.name == "A" for channel in first["channels"]))
+    pixels = read_image(source)
+    return Head(pixels.shape[1], pixels.shape[0], pixels.shape[2] == 4)
 
 
 def read_linear(path: str | Path, *, background: float | None = None) -> NDArray[np.float32]:
@@ -255,22 +285,34 @@ def _check_size(path: Path, width: int, height: int) -> None:
         raise DataError("the picture's claimed size is refused", value=f"{path}: {width} x {height}")
 
 
-def _read_exr(path: Path, nonfinite: str) -> NDArray[np.float32]:
+def _exr_heads(path: Path) -> list[dict[str, Any]]:
+    """The headers of all parts, their claimed sizes checked before any pixel is asked for."""
     import OpenEXR
 
     try:
-        with OpenEXR.File(str(path), header_only=True) as head:
-            claimed = [dict(part.header) for part in head.parts]  # emptied on leaving the `with`
-        for header in claimed:
-            (x0, y0), (x1, y1) = np.asarray(header["dataWindow"], np.int64).tolist()
-            _check_size(path, x1 - x0 + 1, y1 - y0 + 1)
-            (x0, y0), (x1, y1) = np.asarray(header["displayWindow"], np.int64).tolist()
-            _check_size(path, x1 - x0 + 1, y1 - y0 + 1)
-        with OpenEXR.File(str(path)) as file:
-            parts = [(dict(p.header), {name: np.array(c.pixels) for name, c in p.channels.items()}) for p in file.parts]
+        with OpenEXR.File(str(path), header_only=True) as file:
+            heads = [dict(part.header) for part in file.parts]  # emptied on leaving the `with`
+        for head in heads:
+            for window in ("dataWindow", "displayWindow"):
+                (x0, y0), (x1, y1) = np.asarray(head[window], np.int64).tolist()
+                _check_size(path, x1 - x0 + 1, y1 - y0 + 1)
     except DataError:
         raise
     except Exception as error:  # the binding raises RuntimeError, ValueError, TypeError, as it comes
+        raise _damaged(path, str(error)) from error
+    if not heads:
+        raise _damaged(path, "it has no parts")
+    return heads
+
+
+def _read_exr(path: Path, nonfinite: str) -> NDArray[np.float32]:
+    import OpenEXR
+
+    claimed = _exr_heads(path)
+    try:
+        with OpenEXR.File(str(path)) as file:
+            parts = [(dict(p.header), {name: np.array(c.pixels) for name, c in p.channels.items()}) for p in file.parts]
+    except Exception as error:
         raise _damaged(path, str(error)) from error
     if not parts or len(parts) != len(claimed):  # a part whose pixels fail is dropped with a word on stderr
         raise _damaged(path, f"{len(claimed) - len(parts)} of {len(claimed)} parts cannot be read: truncated?")

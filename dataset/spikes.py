@@ -185,24 +185,24 @@ def open_spikes(
     source = Path(path)
     start = _first_bytes(source)
     raster = (height, width, row_bits) != (None, None, None)
-    if start.startswith(b"\x89HDF"):
-        from spikerig.dataset.spikes_h5 import open_h5 as opener
-    elif start.startswith(b"PK\x03\x04"):
-        from spikerig.dataset.spikes_npz import open_npz
-
-        return _with_rate(open_npz(source, axes), rate_hz)
-    else:
-        from spikerig.dataset import m1k40, vidar_dat
-
-        if not raster and (source.suffix.lower() == ".bin" or m1k40.looks_like(source)):
-            opener = m1k40.open_m1k40
-        else:
-            return _with_rate(vidar_dat.open_raster(source, height, width, row_bits, drop_tail), rate_hz)
-    if raster or axes:
+    kind = "spikes-h5" if start.startswith(b"\x89HDF") else "npz" if start.startswith(b"PK\x03\x04") else "raw"
+    if (raster and kind != "raw") or (axes and kind != "npz"):
         raise UsageError(
             "the file says its layout itself", value=source, next="leave out --height, --width, --row-bits and --axes"
         )
-    return _with_rate(opener(source), rate_hz)
+    if kind == "spikes-h5":
+        from spikerig.dataset.spikes_h5 import open_h5
+
+        return _with_rate(open_h5(source), rate_hz)
+    if kind == "npz":
+        from spikerig.dataset.spikes_npz import open_npz
+
+        return _with_rate(open_npz(source, axes), rate_hz)
+    from spikerig.dataset import m1k40, vidar_dat
+
+    if not raster and (source.suffix.lower() == ".bin" or m1k40.looks_like(source)):
+        return _with_rate(m1k40.open_m1k40(source), rate_hz)
+    return _with_rate(vidar_dat.open_raster(source, height, width, row_bits, drop_tail), rate_hz)
 
 
 def write_spikes(

@@ -47,6 +47,7 @@ class SceneWriter:
         light_gain, info, points, clock, calibration: as in Scene; also settable as attributes until closing.
         truth: its clock, effects, seed and label (its mappings are written too); None for a real scene.
         force: replace an existing file, and an unfinished part of an earlier try.
+        keep: keep the views that are whole when the `with` ends in an exception.
 
     Raises:
         UsageError: the file, or an unfinished part of it, exists.
@@ -66,8 +67,10 @@ class SceneWriter:
         calibration: Mapping[str, Any] | None = None,
         truth: Truth | None = None,
         force: bool = False,
+        keep: bool = True,
     ) -> None:
-        self.path, self.name, self.camera, self.truth, self.force = Path(path), name, camera, truth, force
+        self.path, self.name, self.camera, self.truth = Path(path), name, camera, truth
+        self.force, self.keep = force, keep
         self.light_gain, self.info, self.points = light_gain, dict(info or {}), points
         self.clock, self.calibration = clock, calibration
         self.part = self.path.with_name(self.path.name + ".partial")
@@ -231,8 +234,8 @@ class SceneWriter:
         root.close()
         _sync(self.part)
 
-    def abort(self, keep: bool = True) -> None:
-        """Stop: status "aborted"; the part is kept if it holds a view and `keep`, else removed."""
+    def abort(self) -> None:
+        """Stop: status "aborted"; the part is kept if it holds a view and `keep` was asked for, else removed."""
         if not self._file:
             return
         try:
@@ -244,7 +247,7 @@ class SceneWriter:
         except (OSError, RuntimeError):
             pass
         finally:
-            if not (keep and self.names):
+            if not (self.keep and self.names):
                 self.part.unlink(missing_ok=True)
 
     def __enter__(self) -> Self:
@@ -265,14 +268,9 @@ def write(path: str | Path, scene: Scene, force: bool) -> None:
         if strangers:
             raise UsageError("truth of views that the scene does not have", value=sorted(strangers)[:8])
     more = {key: getattr(scene, key) for key in ("light_gain", "info", "points", "clock", "calibration")}
-    out = SceneWriter(path, scene.name, scene.camera, **more, truth=truth, force=force)
-    try:
+    with SceneWriter(path, scene.name, scene.camera, **more, truth=truth, force=force, keep=False) as out:
         for view in scene.views:
             out.add(view)
-        out.close()
-    except BaseException:
-        out.abort(keep=False)
-        raise
 
 
 def put(parent: h5py.Group, name: str, values: ArrayLike) -> h5py.Dataset:

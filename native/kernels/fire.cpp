@@ -69,7 +69,8 @@ struct Pixels {
   alignas(64) int64_t v[PIXELS], d[PIXELS];
   alignas(64) uint32_t v_low[PIXELS], d_low[PIXELS], v_word[PIXELS], d_word[PIXELS];
   alignas(64) uint32_t charge[PIXELS];
-  alignas(64) uint64_t clipped[PIXELS];
+  alignas(64) uint64_t clipped[PIXELS];      // of one stretch of at most TICKS ticks
+  alignas(64) unsigned __int128 lost[PIXELS];  // of all before it
   bool bright[PIXELS / GROUP];  // groups with a pixel at or above one threshold a tick
 
   template <bool ramp>
@@ -157,6 +158,10 @@ struct Pixels {
       }
       std::memcpy(out + t * frame, packed, static_cast<size_t>(std::min(bytes, GROUP / 8)));
     }
+    for (int64_t i = g; i < g + GROUP; ++i) {
+      lost[i] += clipped[i];
+      clipped[i] = 0;
+    }
   }
 };
 
@@ -201,7 +206,7 @@ void fire(const Light &light, uint32_t *charge, uint8_t *bits, double *clipped) 
     }
     each_run([&](int64_t i, int64_t pixel, int64_t n) {
       std::copy_n(state.charge + i, n, charge + pixel);
-      for (int64_t j = 0; j < n; ++j) clipped[pixel + j] = static_cast<double>(state.clipped[i + j]) / UNIT;
+      for (int64_t j = 0; j < n; ++j) clipped[pixel + j] = static_cast<double>(state.lost[i + j]) / UNIT;
     });
   });
 }

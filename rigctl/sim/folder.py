@@ -267,8 +267,10 @@ def _plan(frames: list[Any], where: str, settings: Settings, faults: Faults) -> 
             f"{where}.frames", "have phases in part" if not hold else "have phases, but the light holds: leave them out"
         )
         return None
-    if given and not all(isinstance(p, int | float) and np.isfinite(p) for p in given):
-        faults.add(f"{where}.frames", f"have phases {given!r}, expected numbers, 0 to 1 over the exposure")
+    if given and not all(isinstance(p, int | float) and -100 <= p <= 100 for p in given):
+        faults.add(
+            f"{where}.frames", f"have phases {given!r}, expected numbers: 0 to 1 is the exposure, -100 to 100 all"
+        )
         return None
     if hold:
         knots = np.rint(np.linspace(0, exposure.ticks, n + 1)).astype(np.int64)

@@ -133,7 +133,6 @@ def _checked(value: Any, spec: dataclasses.Field, path: str, faults: Faults) -> 
         good = isinstance(value, int) and not isinstance(value, bool)
     elif kind == "float":
         good = _is_number(value)
-        value = float(value) if good else value
     elif kind == "str":
         good = isinstance(value, str)
     else:
@@ -149,7 +148,7 @@ def _checked(value: Any, spec: dataclasses.Field, path: str, faults: Faults) -> 
     if kind in ("int", "float") and not _inside(value, spec):
         faults.add(path, f"is {value!r}{_range(spec)}")
         return fallback
-    return value
+    return float(value) if kind == "float" else value
 
 
 def _is_number(value: Any) -> bool:
@@ -157,4 +156,4 @@ def _is_number(value: Any) -> bool:
 
 
 def _inside(value: float, spec: dataclasses.Field) -> bool:
-    return math.isfinite(value) and spec.metadata.get("lo", -math.inf) <= value <= spec.metadata.get("hi", math.inf)
+    return spec.metadata.get("lo", -math.inf) <= value <= spec.metadata.get("hi", math.inf) and math.isfinite(value)

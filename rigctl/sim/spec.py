@@ -210,10 +210,6 @@ def _check_exposure(exposure: Exposure, faults: Faults) -> None:
     ticks = exposure.exposure_ms * 1e-3 * exposure.rate_hz
     if ticks < 0.5 or abs(ticks - round(ticks)) > 1e-6 * ticks:
         faults.add("exposure.exposure_ms", f"x rate_hz is {ticks:g} ticks, expected a whole number, at least 1")
-    elif exposure.sub_poses > exposure.ticks + (exposure.light == "linear"):
-        faults.add(
-            "exposure.sub_poses", f"is {exposure.sub_poses}, more than the {exposure.ticks} ticks of an exposure"
-        )
     span_ms = exposure.exposure_ms + 2e3 * exposure.margin_ticks / exposure.rate_hz
     if exposure.period_ms < span_ms:
         faults.add("exposure.period_ms", f"is {exposure.period_ms:g}, less than exposure and margins, {span_ms:g} ms")

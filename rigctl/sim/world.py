@@ -99,7 +99,16 @@ class World:
 
 
 @dataclass(frozen=True, slots=True)
-class _Air:
+class Air:
+    """`[world]`: light from everywhere, and what there is.
+
+    Args:
+        ambient: light that comes from everywhere (r, g, b).
+        contact: how much boxes and spheres darken the ambient light beside them, 0 to 1.
+        sky: light where a ray hits nothing.
+        lamp, solids: see below.
+    """
+
     ambient: Vec3 = limits((0.5, 0.5, 0.5), 0, 1e9)
     contact: float = limits(0.6, 0, 1)
     sky: Vec3 = limits((0.0, 0.0, 0.0), 0, 1e9)
@@ -109,7 +118,7 @@ class _Air:
 
 def read_world(table: Any, faults: Faults) -> World:
     """A world from the `[world]` table of a scene file; faults are noted, not raised."""
-    air = read_record(_Air, table, "world", faults)
+    air = read_record(Air, table, "world", faults)
     lamp = read_record(Lamp, air.lamp, "world.lamp", faults)
     rows = air.solids if air.solids != {} else []
     if not isinstance(rows, list):

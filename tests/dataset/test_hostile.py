@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hard_store import HOSTILE, full_scene
+from hard_store import full_scene
+from spoil import HOSTILE
 
 from spikerig.dataset import hdf5_guard
 from spikerig.dataset.errors import DataError
