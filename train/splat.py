@@ -90,8 +90,8 @@ class _Render(torch.autograd.Function):
     def backward(ctx: Any, image_grad: Any, alpha_grad: Any, _radii: Any) -> Any:  # type: ignore[override]
         width, height = ctx.state.width, ctx.state.height
         shapes = ((image_grad, (height, width, 3)), (alpha_grad, (height, width)))
-        wanted = [np.zeros(size, np.float32) if g is None else g.contiguous().numpy() for g, size in shapes]
-        grads, screen, camera = kernels.render_backward(ctx.state, _arrays(ctx.saved_tensors), *wanted)
+        by_image, by_alpha = (np.zeros(size, np.float32) if g is None else g.contiguous().numpy() for g, size in shapes)
+        grads, screen, camera = kernels.render_backward(ctx.state, _arrays(ctx.saved_tensors), by_image, by_alpha)
         dtype, device = ctx.pose
         pose_grad = torch.from_numpy(camera).to(device, dtype)
         return None, torch.from_numpy(screen), pose_grad, *(torch.from_numpy(g) for g in grads)
