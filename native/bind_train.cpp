@@ -94,11 +94,13 @@ void render_backward(Render &render, In means, In quats, In log_scales, In logit
                      Out g_means2d, OutDouble g_camera) {
   spikerig::Frame &f = *render.frame;
   size_t pixels = size_t(f.camera.width) * f.camera.height, n = static_cast<size_t>(f.splats.n);
-  f.splats = splats_of(means, quats, log_scales, logits, sh);
-  expect(size_t(f.splats.n) == n && g_means.size() == 3 * n && g_quats.size() == 4 * n &&
-             g_log_scales.size() == 3 * n && g_logits.size() == n && g_sh.size() == sh.size() && g_means2d.size() == 2 * n && g_camera.size() == 12,
+  const spikerig::Splats splats = splats_of(means, quats, log_scales, logits, sh);
+  expect(size_t(splats.n) == n && splats.sh_rows == f.splats.sh_rows && g_means.size() == 3 * n &&
+             g_quats.size() == 4 * n && g_log_scales.size() == 3 * n && g_logits.size() == n &&
+             g_sh.size() == sh.size() && g_means2d.size() == 2 * n && g_camera.size() == 12,
          "gradients");
   expect(image_grad.size() == 3 * pixels && alpha_grad.size() == pixels, "pictures");
+  f.splats = splats;
   f.image_grad = image_grad.data();
   f.alpha_grad = alpha_grad.data();
   nb::gil_scoped_release release;
