@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.clocktime import NS
 from spikerig.dataset.errors import DataError, RigError, UsageError
+from spikerig.dataset.hull import hull_points
 from spikerig.dataset.images import SUFFIXES, image_head, linear_from_srgb, read_image, srgb8_from_linear
 from spikerig.dataset.posed import Posed, read_transforms
-from spikerig.dataset.scene import Camera, Frame, View
+from spikerig.dataset.scene import Camera, Frame, Points, View
 from spikerig.dataset.spikes import SpikeStream, open_spikes
 from spikerig.dataset.store import NAME, SceneWriter
 from spikerig.dataset.terminal import note, progress
@@ -33,20 +34,21 @@ class BuildConfig:
     """What to build from and how.
 
     Args:
-        spikes, rgb: folders of spike files and of pictures.
+        rgb, spikes: folders of pictures and of spike files; without spikes, a scene of pictures only.
         transforms, colmap: a transforms.json, or the folder of a COLMAP model: exactly one.
         rate_hz: ticks a second; None takes each file's own.
         exposure_us: of the pictures, centred in their spikes; None: as long as the spikes.
         height, width, row_bits, axes: layout of raw spike files, as for `open_spikes`.
-        test_every: every how-manyth view is held out, from the first; 0: none.
+        test_every: every how-manyth view is held out, from the first; 0: none, 1: all.
         background: gray behind transparent pixels, encoded, 0 black to 1 white; None: transparency is a fault.
         resize: bring pictures of another size to that of the spikes, by area average of linear light.
+        size: (width, height) of the scene, where there are no spikes to say it; pictures are brought to it.
         skip_unmatched: leave out what has no partner instead of refusing.
         name: of the scene; None takes the file's stem.
     """
 
-    spikes: Path
     rgb: Path
+    spikes: Path | None = None
     transforms: Path | None = None
     colmap: Path | None = None
     rate_hz: float | None = None
@@ -58,6 +60,7 @@ class BuildConfig:
     test_every: int = 0
     background: float | None = None
     resize: bool = False
+    size: tuple[int, int] | None = None
     skip_unmatched: bool = False
     name: str | None = None
 
@@ -94,7 +97,7 @@ def build_scene(config: BuildConfig, out: str | Path, *, force: bool = False) ->
         "notes": plan.notes,
     }
     name = config.name or Path(out).stem
-    points = plan.posed.points
+    points = plan.posed.points or _silhouette_points(plan)
     with SceneWriter(out, name, plan.camera, info=info, points=points, force=force, keep=False) as writer:
         for view_name, picture, spikes, split in progress(plan.views, "building the scene", "view"):
             writer.add(_view(config, plan, view_name, picture, spikes, split))
@@ -104,11 +107,22 @@ def build_scene(config: BuildConfig, out: str | Path, *, force: bool = False) ->
         return {"scene": str(out), **made.describe(), "notes": plan.notes}
 
 
+def _silhouette_points(plan: Plan) -> Points | None:
+    """Points inside all silhouettes, where every training picture has an alpha; None elsewhere."""
+    train = [(name, picture) for name, picture, _, split in plan.views if split == "train"]
+    if not train or not all(image_head(picture).alpha for _, picture in train):
+        return None
+    rgba = [read_image(picture) for _, picture in progress(train, "reading silhouettes", "picture")]
+    if any(picture.dtype != np.uint8 for picture in rgba):
+        return None
+    return hull_points(plan.camera, [plan.posed.poses[name] for name, _ in train], rgba)
+
+
 def plan_scene(config: BuildConfig) -> Plan:
     """Match files and check everything that can be checked without reading spikes; see `build_scene`."""
     _check_options(config)
     pictures, faults = _listed(config.rgb, SUFFIXES)
-    streams, more = _listed(config.spikes, SPIKE_SUFFIXES)
+    streams, more = _listed(config.spikes, SPIKE_SUFFIXES) if config.spikes is not None else ({}, [])
     faults += more
     if not pictures:
         raise UsageError("no pictures in this folder", value=config.rgb, expected=", ".join(SUFFIXES))
@@ -118,7 +132,8 @@ def plan_scene(config: BuildConfig) -> Plan:
     held = {stem for i, stem in enumerate(order) if config.test_every and i % config.test_every == 0}
     notes: list[str] = []
     lonely = [f"{stem}: a pose, but no picture" for stem in order if stem not in pictures]
-    lonely += [f"{stem}: a pose, but no spikes" for stem in order if stem not in streams and stem not in held]
+    bare = set(order) if config.spikes is None else held
+    lonely += [f"{stem}: a pose, but no spikes" for stem in order if stem not in streams and stem not in bare]
     lonely += [
         f"{path.name}: no pose" for stem, path in (*pictures.items(), *streams.items()) if stem not in posed.poses
     ]
@@ -126,7 +141,7 @@ def plan_scene(config: BuildConfig) -> Plan:
         notes += [f"left out: {line}" for line in lonely]
     else:
         faults += lonely
-    whole = [s for s in order if s in pictures and (s in streams or s in held)]
+    whole = [s for s in order if s in pictures and (s in streams or s in bare)]
     faults += [f"{stem!r}: not a view's name (letters, digits, - _ .)" for stem in whole if not NAME.fullmatch(stem)]
     if not whole:
         faults.append("nothing has a picture, spikes and a pose")
@@ -152,14 +167,16 @@ def natural(stem: str) -> list[tuple[int, int | str]]:
 def _check_options(config: BuildConfig) -> None:
     if (config.transforms is None) == (config.colmap is None):
         raise UsageError("give the poses once", expected="--transforms FILE or --colmap FOLDER")
-    if config.test_every < 0 or config.test_every == 1:
-        raise UsageError("--test-every N holds out each Nth view", value=config.test_every, expected="0, or 2 and more")
+    if config.test_every < 0:
+        raise UsageError("--test-every N holds out each Nth view", value=config.test_every, expected="0 or more")
     if config.exposure_us is not None and not 0 <= config.exposure_us < 1e9:
         raise UsageError("an exposure is at least 0", value=f"{config.exposure_us} us")
     if config.background is not None and not 0 <= config.background <= 1:
         raise UsageError("a background is a gray from 0 (black) to 1 (white)", value=config.background)
+    if config.size is not None and (config.spikes is not None or min(config.size) < 1):
+        raise UsageError("--size is for scenes of pictures only: spikes say the size", value=config.size)
     for folder in (config.rgb, config.spikes):
-        if not folder.is_dir():
+        if folder is not None and not folder.is_dir():
             raise UsageError("there is no such folder", value=folder)
 
 
@@ -213,7 +230,7 @@ def _fit_camera(
 ) -> tuple[Camera, list[str]]:
     """The scene's camera, of the spikes' size, and what is wrong with sizes, rates and lengths."""
     faults: list[str] = []
-    target: tuple[int, int] | None = None
+    target: tuple[int, int] | None = config.size
     for stem, picture in pictures:
         faults += _told(picture.name, lambda p=picture: _picture_faults(config, p, camera))
         if stem not in streams:
@@ -233,11 +250,11 @@ def _fit_camera(
     if target is None or target == (camera.width, camera.height):
         return camera, faults
     sx, sy = target[0] / camera.width, target[1] / camera.height
-    if not config.resize:
+    if not config.resize and config.size is None:
         size = f"{camera.width} x {camera.height}"
         faults.append(f"the pictures are {size}, the spikes {target[0]} x {target[1]}: --resize brings them together")
     elif abs(camera.width * sy - target[0]) > 1:
-        faults.append(f"pictures {camera.width} x {camera.height} and spikes {target[0]} x {target[1]} differ in shape")
+        faults.append(f"pictures {camera.width} x {camera.height} and {target[0]} x {target[1]} differ in shape")
     scaled = np.diag([sx, sy, 1.0]) @ camera.K  # pixel centres at +0.5: a resize is a plain scaling
     return Camera(scaled, np.zeros(0), *target), faults
 

@@ -153,16 +153,15 @@ def _key(s: os.stat_result) -> str:
 def linked(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset:
     """A member of a group by its plain name, a group or a dataset behind a hard link."""
     raw = name.encode()
-    where = spot(group, name)
     if not group.id.links.exists(raw):
-        raise refuse(where, "it is missing")
+        raise refuse(spot(group, name), "it is missing")
     if group.id.links.get_info(raw).type != h5l.TYPE_HARD:
-        raise refuse(where, "a soft, external or user-defined link: only hard links are followed")
+        raise refuse(spot(group, name), "a soft, external or user-defined link: only hard links are followed")
     found = h5o.open(group.id, raw)
     if isinstance(found, h5g.GroupID):
         return h5py.Group(found)
     if not isinstance(found, h5d.DatasetID):
-        raise refuse(where, "neither a group nor a dataset")
+        raise refuse(spot(group, name), "neither a group nor a dataset")
     return h5py.Dataset(found)
 
 
@@ -188,25 +187,25 @@ def check_dataset(dataset: h5py.Dataset) -> None:
 
     Cost: some 30 us, and 1 us a chunk.
     """
-    where, plan, kind = spot(dataset), dataset.id.get_create_plist(), dataset.id.get_type()
+    plan, kind = dataset.id.get_create_plist(), dataset.id.get_type()
     if not isinstance(kind, h5t.TypeIntegerID | h5t.TypeFloatID):
-        raise refuse(where, f"type {type(kind).__name__}: only integers and floats are read")
+        raise refuse(spot(dataset), f"type {type(kind).__name__}: only integers and floats are read")
     space = dataset.id.get_space()
     if space.get_simple_extent_type() != h5s.SIMPLE:
-        raise refuse(where, "a scalar or null dataspace")
+        raise refuse(spot(dataset), "a scalar or null dataspace")
     shape = dataset.id.shape
     size = math.prod(shape) * kind.get_size()
     layout = plan.get_layout()
     if layout == h5d.VIRTUAL or plan.get_external_count():
-        raise refuse(where, "its data lie in other files")
+        raise refuse(spot(dataset), "its data lie in other files")
     codes = [plan.get_filter(i)[0] for i in range(plan.get_nfilters())]
     if any(code not in FILTERS for code in codes):
-        raise refuse(where, f"filter {codes}: allowed are {sorted(FILTERS.values())}")
+        raise refuse(spot(dataset), f"filter {codes}: allowed are {sorted(FILTERS.values())}")
     end = os.fstat(dataset.file.id.get_vfd_handle()).st_size
     if layout == h5d.CHUNKED:
         _check_chunks(dataset, size, bool(codes), end)
     elif dataset.id.get_storage_size() != size or (size and layout == h5d.CONTIGUOUS and _outside(dataset, end)):
-        raise refuse(where, f"claims {size} bytes of shape {shape} that the file does not hold")
+        raise refuse(spot(dataset), f"claims {size} bytes of shape {shape} that the file does not hold")
 
 
 def _outside(dataset: h5py.Dataset, end: int) -> bool:
@@ -215,14 +214,16 @@ def _outside(dataset: h5py.Dataset, end: int) -> bool:
 
 
 def _check_chunks(dataset: h5py.Dataset, size: int, filtered: bool, end: int) -> None:
-    where, chunk, shape = spot(dataset), dataset.chunks or (1,), dataset.id.shape
+    chunk, shape = dataset.chunks or (1,), dataset.id.shape
     step = math.prod(chunk) * dataset.id.get_type().get_size()
     need = math.prod(-(-n // c) for n, c in zip(shape, chunk, strict=True))
     held = dataset.id.get_storage_size()
     if step > MAX_CHUNK or need > end or size > (max(MAX_CHUNK, held * MAX_INFLATION) if filtered else held):
-        raise refuse(where, f"claims {size} bytes of shape {shape} in chunks of {chunk} from {held} bytes stored")
+        raise refuse(
+            spot(dataset), f"claims {size} bytes of shape {shape} in chunks of {chunk} from {held} bytes stored"
+        )
     if dataset.id.get_num_chunks() != need:
-        raise refuse(where, f"{dataset.id.get_num_chunks()} of {need} chunks are there")
+        raise refuse(spot(dataset), f"{dataset.id.get_num_chunks()} of {need} chunks are there")
     seen: list[str] = []
 
     def look(info: Any) -> None:
@@ -232,7 +233,7 @@ def _check_chunks(dataset: h5py.Dataset, size: int, filtered: bool, end: int) ->
 
     dataset.id.chunk_iter(look)
     if seen:
-        raise refuse(where, seen[0])
+        raise refuse(spot(dataset), seen[0])
 
 
 def walk(group: h5py.Group, depth: int = 0, seen: set[int] | None = None) -> Iterator[h5py.Group | h5py.Dataset]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.errors import DataError, UsageError
-from spikerig.dataset.spikes import SpikeFile, SpikeStream
+from spikerig.dataset.stream import SpikeFile, SpikeStream
 from spikerig.dataset.vidar_dat import read_bytes
 
 Bits = NDArray[np.uint8]
@@ -101,7 +101,8 @@ def _decode(file: BinaryIO, path: Path, start: int, first: int, out: Bits) -> No
 
 
 def _tags(ends: Bits) -> NDArray[np.uint16]:
-    return (ends[..., 0].astype(np.uint16) | (ends[..., 1].astype(np.uint16) << 8)) >> 4
+    words = ends[..., 0].astype(np.uint16) | (ends[..., 1].astype(np.uint16) << 8)
+    return (words >> 4).astype(np.uint16)
 
 
 def write_m1k40(path: Path, stream: SpikeStream) -> None:

@@ -87,4 +87,6 @@ def fire(
     taken = np.minimum(every, 2**32)
     total = charge.astype(np.int64) + np.concatenate([np.zeros_like(taken[:1]), taken]).cumsum(0)[: len(taken) + 1]
     fired = np.diff(total >> 32, axis=0)
-    return pack(fired), (total[-1] & 0xFFFFFFFF).astype(np.uint32), (every - taken).sum(0) / 2.0**32
+    excess = every - taken
+    clipped = (excess >> 26).sum(0).astype(object) * 2**26 + (excess & (2**26 - 1)).sum(0)  # beyond 64 bits
+    return pack(fired), (total[-1] & 0xFFFFFFFF).astype(np.uint32), (clipped / 2**32).astype(np.float64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict
 from pathlib import Path
 
@@ -28,9 +29,11 @@ def verify(
 
 
 def build(
-    spikes: Path = typer.Option(..., help="Folder of spike files: .dat, .bin, .npz, .h5."),
     rgb: Path = typer.Option(..., help="Folder of pictures: .png, .jpg, .exr."),
     out: Path = typer.Option(..., "--out", "-o", help="The scene to write (.h5)."),
+    spikes: Path | None = typer.Option(
+        None, help="Folder of spike files: .dat, .bin, .npz, .h5; without it, a scene of pictures only."
+    ),
     transforms: Path | None = typer.Option(None, help="Poses: a transforms.json of NeRF or nerfstudio."),
     colmap: Path | None = typer.Option(None, help="Poses and points: the folder of a COLMAP model."),
     rate_hz: float | None = typer.Option(None, help="Ticks a second, where the files do not say."),
@@ -39,9 +42,10 @@ def build(
     width: int | None = typer.Option(None, help="Of raw spike files."),
     row_bits: int | None = typer.Option(None, help="Bits a row of raw spike files, e.g. 400 or 416."),
     axes: str | None = typer.Option(None, help="Order of .npz arrays: THW or HWT."),
-    test_every: int = typer.Option(0, help="Hold out every Nth view, from the first; 0: none."),
+    test_every: int = typer.Option(0, help="Hold out every Nth view, from the first; 0: none, 1: all."),
     background: str | None = typer.Option(None, help="Behind transparent pixels: black, white, or a gray 0 to 1."),
     resize: bool = typer.Option(False, "--resize", help="Bring pictures to the spikes' size (area average)."),
+    size: str | None = typer.Option(None, help="WIDTHxHEIGHT of a scene of pictures only; pictures are brought to it."),
     skip_unmatched: bool = typer.Option(False, "--skip-unmatched", help="Leave out what has no partner."),
     name: str | None = typer.Option(None, help="Of the scene; default: the file's stem."),
     force: bool = typer.Option(False, "--force", help="Replace an existing scene."),
@@ -55,10 +59,16 @@ def build(
         gray = None if background is None else float({"black": "0", "white": "1"}.get(background, background))
     except ValueError as error:
         raise UsageError("not a background", value=background, expected="black, white, or a gray 0 to 1") from error
+    wanted = None
+    if size is not None:
+        match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", size)
+        if match is None:
+            raise UsageError("not a size", value=size, expected="WIDTHxHEIGHT, e.g. 400x400")
+        wanted = (int(match[1]), int(match[2]))
     layout = {"height": height, "width": width, "row_bits": row_bits, "axes": axes}
     config = BuildConfig(
-        spikes, rgb, transforms, colmap, rate_hz, exposure_us, **layout, test_every=test_every, background=gray,
-        resize=resize, skip_unmatched=skip_unmatched, name=name,
+        rgb, spikes, transforms, colmap, rate_hz, exposure_us, **layout, test_every=test_every, background=gray,
+        resize=resize, size=wanted, skip_unmatched=skip_unmatched, name=name,
     )  # fmt: skip
     made = build_scene(config, out, force=force)
     if as_json:

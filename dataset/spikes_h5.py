@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.hdf5_guard import check_attribute, hdf5_faults, member, open_file, refuse, spot
-from spikerig.dataset.spikes import SpikeFile, SpikeStream
+from spikerig.dataset.stream import SpikeFile, SpikeStream
 
 FORMAT, VERSION = "spikerig-spikes", "1.0"
 _CHUNK = 1 << 20
@@ -33,9 +33,9 @@ class H5Writer:
 
     def __init__(self, path: Path, like: SpikeStream | SpikeFile) -> None:
         row = (like.width + 7) // 8
-        self.file = h5py.File(path, "w", libver=("v110", "v110"))
+        self.file = h5py.File(path, "w", libver=("v110", "v110"), rdcc_nbytes=16 << 20)
         self.file.attrs.update({k: np.bytes_(v) for k, v in _head("recording").items()})
-        group = self.file.create_group("spikes")
+        self.group = group = self.file.create_group("spikes")
         group.attrs["width"] = np.int64(like.width)
         group.attrs["t0_ns"] = np.int64(like.t0_ns)
         group.attrs["clock"] = np.bytes_(like.clock.encode())
@@ -66,7 +66,7 @@ class H5Writer:
     def __exit__(self, kind: object, *_: object) -> None:
         if kind is None:
             lost = np.concatenate([*self.lost, np.zeros((0, 2), np.int64)])
-            self.file["spikes"].create_dataset("lost", data=_joined(lost))
+            self.group.create_dataset("lost", data=_joined(lost))
             self.file.attrs["status"] = np.bytes_("complete")
         self.file.close()
 

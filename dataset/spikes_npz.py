@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.errors import DataError, UsageError
-from spikerig.dataset.spikes import SpikeFile, SpikeStream
+from spikerig.dataset.stream import SpikeFile, SpikeStream
 
 Bits = NDArray[np.uint8]
 OURS = "spikerig-spikes-1"

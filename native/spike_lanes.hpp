@@ -193,4 +193,33 @@ inline Words load_words(const uint32_t *from) {
 }
 inline void store_words(uint32_t *to, Words w) { std::memcpy(to, &w, sizeof w); }
 
+// ---- doubles and the integers of their width ------------------------------------------------------------------
+
+constexpr int DOUBLES = WIDE / 8;
+typedef double Doubles __attribute__((vector_size(WIDE)));
+typedef uint64_t Longs __attribute__((vector_size(WIDE)));
+
+inline Doubles load_doubles(const float *from) {
+#if SPIKERIG_LANES == 16
+  return _mm512_cvtps_pd(_mm256_loadu_ps(from));
+#elif SPIKERIG_LANES == 8
+  return _mm256_cvtps_pd(_mm_loadu_ps(from));
+#else
+  return Doubles{from[0], from[1]};
+#endif
+}
+
+inline void store_low(uint32_t *to, Longs x) {  // the low word of each
+#if SPIKERIG_LANES == 16
+  _mm256_storeu_si256(reinterpret_cast<__m256i *>(to), _mm512_cvtepi64_epi32((__m512i)x));
+#elif SPIKERIG_LANES == 8
+  const __m256i even = _mm256_setr_epi32(0, 2, 4, 6, 0, 2, 4, 6);
+  const __m256i low = _mm256_permutevar8x32_epi32((__m256i)x, even);
+  _mm_storeu_si128(reinterpret_cast<__m128i *>(to), _mm256_castsi256_si128(low));
+#else
+  to[0] = static_cast<uint32_t>(x[0]);
+  to[1] = static_cast<uint32_t>(x[1]);
+#endif
+}
+
 }  // namespace spikerig::SPIKERIG_ISA

@@ -1,13 +1,8 @@
-"""Hard inputs of the scene file and the pictures: a scene with everything in it, and files made to do harm."""
+"""Hard inputs of the scene file and the pictures; a small scene with everything in it, and an exact comparison."""
 
-import os
-import zlib
-from collections.abc import Callable
 from dataclasses import fields, is_dataclass
-from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from spikerig.dataset.clocktime import ClockModel
@@ -94,277 +89,185 @@ def same(a: Any, b: Any, where: str = "scene") -> None:
         assert a == b, where
 
 
-# ---- files made to do harm: each takes the path of a good scene (named view "a") and spoils it ---------------------
-
-
-def _swap(path: Path, name: str, make: Callable[[h5py.Group, str], Any]) -> None:
-    with h5py.File(path, "r+") as file:
-        parent, last = file[name].parent, name.rsplit("/", 1)[1]
-        del parent[last]
-        make(parent, last)
-
-
-def external_link(path: Path) -> None:
-    _swap(path, "/views/a/pose", lambda g, n: g.__setitem__(n, h5py.ExternalLink("/etc/passwd", "/x")))
-
-
-def soft_link(path: Path) -> None:
-    _swap(path, "/views/a/pose", lambda g, n: g.__setitem__(n, h5py.SoftLink("/camera/K")))
-
-
-def soft_link_to_itself(path: Path) -> None:
-    _swap(path, "/views/a", lambda g, n: g.__setitem__(n, h5py.SoftLink("/views/a")))
-
-
-def hard_link_cycle(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file["/views/a/again"] = file["/views"]
-
-
-def virtual_dataset(path: Path) -> None:
-    layout = h5py.VirtualLayout((3, 4), "<f8")
-    layout[:] = h5py.VirtualSource("/etc/passwd", "x", (3, 4))
-    _swap(path, "/views/a/pose", lambda g, n: g.create_virtual_dataset(n, layout))
-
-
-def external_storage(path: Path) -> None:
-    def make(group: h5py.Group, name: str) -> None:
-        group.create_dataset(name, (3, 4), "<f8", external=[("/etc/passwd", 0, 96)])
-
-    _swap(path, "/views/a/pose", make)
-
-
-def huge_empty_chunks(path: Path) -> None:
-    """40 TB claimed, nothing stored."""
-    _swap(path, "/views/a/spikes", lambda g, n: g.create_dataset(n, (1 << 40, 13, 3), "|u1", chunks=(1 << 10, 13, 3)))
-
-
-def huge_contiguous(path: Path) -> None:
-    """40 TB claimed in one piece that was never written."""
-    _swap(path, "/views/a/spikes", lambda g, n: g.create_dataset(n, (1 << 40, 13, 3), "|u1"))
-
-
-def deflate_bomb(path: Path) -> None:
-    """2 GB of zeros in 2 MB, every chunk honestly there."""
-    zeros = zlib.compress(bytes(1 << 24), 9)
-
-    def make(group: h5py.Group, name: str) -> None:
-        made = group.create_dataset(name, (1, 1 << 19, 1 << 12), "|u1", chunks=(1, 1 << 12, 1 << 12), compression=9)
-        for k in range(0, 1 << 19, 1 << 12):
-            made.id.write_direct_chunk((0, k, 0), zeros)
-
-    _swap(path, "/views/a/spikes", make)
-
-
-def wrong_dtype(path: Path) -> None:
-    _swap(path, "/views/a/pose", lambda g, n: g.create_dataset(n, data=np.eye(4, dtype="<f4")[:3]))
-
-
-def text_for_numbers(path: Path) -> None:
-    _swap(path, "/views/a/pose", lambda g, n: g.create_dataset(n, data=["a", "b"], dtype=h5py.string_dtype()))
-
-
-def reference_type(path: Path) -> None:
-    _swap(path, "/views/a/pose", lambda g, n: g.create_dataset(n, (1,), h5py.ref_dtype))
-
-
-def scalar_for_array(path: Path) -> None:
-    _swap(path, "/views/a/pose", lambda g, n: g.create_dataset(n, data=1.0))
-
-
-def group_for_dataset(path: Path) -> None:
-    _swap(path, "/views/a/pose", lambda g, n: g.create_group(n))
-
-
-def unknown_filter(path: Path) -> None:
-    def make(group: h5py.Group, name: str) -> None:
-        group.create_dataset(name, data=np.eye(4)[:3], chunks=(3, 4), compression="lzf")
-
-    _swap(path, "/views/a/pose", make)
-
-
-def missing_dataset(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        del file["/views/a/pose"]
-
-
-def missing_camera(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        del file["/camera"]
-
-
-def missing_attribute(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        del file["/views/a/pixels"].attrs["start_ns"]
-
-
-def text_attribute_for_number(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file["/views/a/pixels"].attrs["start_ns"] = np.bytes_(b"soon")
-
-
-def endless_text_attribute(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file.attrs["name"] = "n" * 200_000
-
-
-def array_attribute(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file["/views/a"].attrs["order"] = np.zeros(5000, np.int64)
-
-
-def camera_of_another_size(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file["camera"].attrs["width"] = np.int64(1 << 40)
-
-
-def mirrored_pose(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file["/views/a/pose"][...] = np.diag([1, 1, -1, 1])[:3]
-
-
-def pose_of_nan(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file["/views/a/pose"][...] = np.nan
-
-
-def lost_beyond_the_end(path: Path) -> None:
-    _swap(path, "/views/v-01.x/lost", lambda g, n: g.create_dataset(n, data=np.array([[0, 1 << 60]])))
-
-
-def lost_backwards(path: Path) -> None:
-    _swap(path, "/views/v-01.x/lost", lambda g, n: g.create_dataset(n, data=np.array([[9, 3]])))
-
-
-def padding_bits(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file["/views/v-01.x/spikes"][5, 5, -1] = 0xFF
-
-
-def width_beyond_the_row(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file["/views/v-01.x/spikes"].attrs["width"] = np.int64(4000)
-
-
-def info_not_json(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file["info"][0] = 0xFF
-
-
-def info_nested_deep(path: Path) -> None:
-    text = b'{"a":' + b"[" * 200_000
-    _swap(path, "/info", lambda g, n: g.create_dataset(n, data=np.frombuffer(text, np.uint8)))
-
-
-def name_with_dots(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file["/views"].move("a", "...")
-
-
-def name_that_climbs(path: Path) -> None:
-    """A member called "../../xy": HDF5 refuses to make it, so it is patched into a file without checksums."""
-    with h5py.File(path) as good, h5py.File(path.with_suffix(".old"), "w", libver="earliest") as old:
-        old.create_group("views")  # of the old kind: its members' names lie in a plain heap
-        for name in [*(n for n in good if n != "views"), *(f"views/{n}" for n in good["views"])]:
-            good.copy(name, old, name)
-        for name in good.attrs:
-            old.attrs[name] = good.attrs[name]
-        old["views"].move("v-01.x", "QQQQQQQQ")
-    data = path.with_suffix(".old").read_bytes()
-    assert data.count(b"QQQQQQQQ") == 1
-    path.write_bytes(data.replace(b"QQQQQQQQ", b"../../xy"))
-
-
-def name_of_the_parent(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file["/views"].move("a", "..")
-
-
-def name_of_a_device(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file["/views"].move("a", "con\n<script>")
-
-
-def future_major(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file.attrs["version"] = np.bytes_(b"2.0")
-
-
-def version_of_nonsense(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file.attrs["version"] = np.bytes_(b"1.0; rm -rf /")
-
-
-def another_format(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file.attrs["format"] = np.bytes_(b"RS-4D")
-
-
-def not_hdf5(path: Path) -> None:
-    path.write_bytes(b"\x93NUMPY" + bytes(5000))
-
-
-def empty(path: Path) -> None:
-    path.write_bytes(b"")
-
-
-def only_the_signature(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[:8])
-
-
-def folder(path: Path) -> None:
-    path.unlink()
-    path.mkdir()
-
-
-def pipe(path: Path) -> None:
-    path.unlink()
-    os.mkfifo(path)
-
-
-# What opening and reading everything must end in (a DataError), and what `data verify` says: None means unreadable
-# (exit 4), a text means a finding with it (exit 1).
-HOSTILE: dict[Callable[[Path], None], str | None] = {
-    external_link: None,
-    soft_link: None,
-    soft_link_to_itself: None,
-    hard_link_cycle: None,
-    virtual_dataset: None,
-    external_storage: None,
-    huge_empty_chunks: None,
-    huge_contiguous: None,
-    deflate_bomb: None,
-    text_for_numbers: None,
-    reference_type: None,
-    scalar_for_array: None,
-    unknown_filter: None,
-    endless_text_attribute: None,
-    array_attribute: None,
-    name_that_climbs: None,
-    name_of_the_parent: None,
-    future_major: None,
-    version_of_nonsense: None,
-    another_format: None,
-    not_hdf5: None,
-    empty: None,
-    only_the_signature: None,
-    folder: None,
-    pipe: None,
-    wrong_dtype: "not what the schema says",
-    group_for_dataset: "not the f8 that belongs there",
-    missing_dataset: "pose is missing",
-    missing_camera: "camera is missing",
-    missing_attribute: "start_ns is missing",
-    text_attribute_for_number: "where int belongs",
-    camera_of_another_size: "not those that were written",
-    mirrored_pose: "not those that were written",
-    pose_of_nan: "not finite",
-    lost_beyond_the_end: "not those that were written",
-    lost_backwards: "not those that were written",
-    padding_bits: "not those that were written",
-    width_beyond_the_row: "not those that were written",
-    info_not_json: "not those that were written",
-    info_nested_deep: "not those that were written",
-    name_with_dots: "not those that were written",
-    name_of_a_device: "not those that were written",
-}
+ROWS = [
+    (
+        "external, soft, self-referring links; a cycle of hard links",
+        "open_scene, verify_scene",
+        "one DataError naming the place; nothing outside the file is opened",
+        "dataset/test_hostile.py::test_hostile_files_end_in_one_error",
+    ),
+    (
+        "virtual dataset, external storage, a filter not on the list",
+        "open_scene, verify_scene",
+        "one DataError",
+        "dataset/test_hostile.py::test_hostile_files_end_in_one_error",
+    ),
+    (
+        "40 TB claimed and nothing stored; 2 GB of zeros deflated to 2 MB",
+        "open_scene, verify_scene",
+        "one DataError before memory is asked for",
+        "dataset/test_hostile.py::test_hostile_files_end_in_one_error",
+    ),
+    (
+        "wrong type, a missing dataset or attribute, text for a number, a mirrored or NaN pose",
+        "open_scene, verify_scene",
+        "reading: one DataError; verifying: a finding that names it",
+        "dataset/test_hostile.py::test_hostile_files_end_in_one_error",
+    ),
+    (
+        "member names `../../xy`, `..`, `...`, with a line break or markup",
+        "open_scene, verify_scene",
+        "one DataError; the name is shown escaped, never used as a path",
+        "dataset/test_hostile.py::test_hostile_files_end_in_one_error",
+    ),
+    (
+        "not HDF5, empty, eight bytes, a folder, a named pipe",
+        "open_scene, verify_scene",
+        "one DataError at once",
+        "dataset/test_hostile.py::test_hostile_files_end_in_one_error",
+    ),
+    (
+        "files of HDF5's CVE reports (some crash the library)",
+        "open_scene, verify_scene",
+        "one DataError; the child process may die, this one does not",
+        "dataset/test_hostile.py::test_files_from_cve_reports",
+    ),
+    (
+        "the child process crashes, hangs, answers nonsense",
+        "ask_child",
+        "one DataError that says which",
+        "dataset/test_hostile.py::test_a_child_that_crashes_hangs_or_starves_is_a_data_error",
+    ),
+    (
+        "cut at ten places",
+        "open_scene",
+        "one DataError",
+        "dataset/test_hostile.py::test_truncated_anywhere",
+    ),
+    (
+        "one bit flipped in every dataset",
+        "verify_scene",
+        "a critical finding for each, by name",
+        "dataset/test_store.py::test_a_flipped_bit_in_any_dataset_is_found_and_named",
+    ),
+    (
+        "one bit flipped in the file's own structure",
+        "verify_scene",
+        "refused, or a finding",
+        "dataset/test_hostile.py::test_one_flipped_bit_of_metadata_is_found",
+    ),
+    (
+        "an attribute changed",
+        "verify_scene",
+        "a checksum finding at its object",
+        "dataset/test_store.py::test_a_changed_attribute_is_found",
+    ),
+    (
+        "kill -9 while writing",
+        "SceneWriter, open_scene",
+        "status recording, a clear error; whole views readable when asked for",
+        "dataset/test_store.py::test_a_kill_leaves_a_recording_part_whose_whole_views_can_be_read",
+    ),
+    (
+        "an exception while writing",
+        "SceneWriter",
+        "status aborted, the target untouched",
+        "dataset/test_store.py::test_an_exception_leaves_an_aborted_part_that_says_so",
+    ),
+    (
+        "the disk is full",
+        "write_scene",
+        "one HostError, no file",
+        "dataset/test_store.py::test_a_full_disk_is_one_clear_error",
+    ),
+    (
+        "version 1.7, version 2.0",
+        "open_scene",
+        "read with a note; refused with what to do",
+        "dataset/test_store.py::test_a_newer_major_version_is_refused_with_what_to_do",
+    ),
+    (
+        "zero ticks, no rate, no spikes, 2^62 as a seed, 13x21 pixels, a distortion of 1e-17, nothing lost",
+        "write_scene, SceneFile.read",
+        "equal to the last bit",
+        "dataset/test_store.py::test_everything_round_trips_to_the_last_bit",
+    ),
+    (
+        "a window that cuts through lost ranges; no rate",
+        "SceneFile.spikes",
+        "lost and t0_ns counted from the window",
+        "dataset/test_store.py::test_a_window_of_spikes_is_that_slice_in_time",
+    ),
+    (
+        "light below 0, above 1, at the knee, NaN",
+        "srgb_from_linear",
+        "straight below, power above, NaN stays NaN",
+        "dataset/test_images.py::test_the_srgb_curve_at_published_values",
+    ),
+    (
+        "flipped, cropped, BGR, transposed, Fortran, strided, float64, half arrays",
+        "write_image (EXR)",
+        "the same pixels back (OpenEXR itself writes wrong ones)",
+        "dataset/test_images.py::test_exr_round_trips_from_any_memory_layout",
+    ),
+    (
+        "an EXR, PNG or JPEG that breaks off anywhere",
+        "read_image",
+        "one DataError",
+        "dataset/test_images.py::test_a_truncated_picture_is_one_data_error",
+    ),
+    (
+        "data window beside, inside, outside the display window",
+        "read_image (EXR)",
+        "on the display window, 0 where unsaid; a DataError where they do not meet",
+        "dataset/test_images.py::test_exr_is_read_on_its_display_window",
+    ),
+    (
+        "NaN and infinities in an EXR",
+        "read_image",
+        "NumericsError with their number",
+        "dataset/test_images.py::test_exr_with_nan_or_infinities_is_refused_unless_kept",
+    ),
+    (
+        "luminance-chroma, deep, multi-view, tiled, lone channels",
+        "read_image (EXR)",
+        "read or refused, as listed",
+        "dataset/test_images.py::test_awkward_exr_files_are_read_or_refused",
+    ),
+    (
+        "a picture claiming 100,000 x 100,000",
+        "read_image",
+        "DataError before anything is decoded",
+        "dataset/test_images.py::test_claimed_sizes_are_checked_before_anything_is_decoded",
+    ),
+    (
+        "a texture with nothing known",
+        "texture_png",
+        "gain 1, all transparent",
+        "dataset/test_images.py::test_the_png_of_a_texture",
+    ),
+    (
+        "scaled, mirrored, NaN, 2x4 and float32 matrices",
+        "read_transforms",
+        "a rotation to the last bit, or one DataError naming the frame",
+        "dataset/test_posed.py::test_float32_drift_is_taken_out_and_worse_is_refused",
+    ),
+    (
+        "COLMAP models cut anywhere or claiming 2^62 records",
+        "read_colmap",
+        "one DataError",
+        "dataset/test_posed.py::test_damaged_colmap_models_end_in_data_errors",
+    ),
+    (
+        "pictures, spikes and poses that do not match",
+        "build_scene",
+        "all faults at once, nothing written",
+        "dataset/test_build.py::test_every_fault_is_told_at_once_and_nothing_is_written",
+    ),
+    (
+        "a forked worker with the parent's file open",
+        "SceneDataset",
+        "the same items",
+        "train/test_scene_dataset.py::test_workers_give_the_same_items",
+    ),
+]

@@ -20,13 +20,6 @@ constexpr int64_t TICKS = 64;            // ticks a group runs before the next g
 constexpr double UNIT = 4294967296.0;    // 2^32
 constexpr double ROUND = 6755399441055744.0;  // 1.5 * 2^52: adding it leaves the nearest integer in the low bits
 
-// Vectors of doubles and of the integers of the same width; the compiler does not find these loops by itself.
-constexpr int DOUBLES = sizeof(Wide) / 8;
-typedef double Doubles __attribute__((vector_size(8 * DOUBLES)));
-typedef uint64_t Longs __attribute__((vector_size(8 * DOUBLES)));
-typedef float Floats __attribute__((vector_size(4 * DOUBLES)));
-typedef uint32_t Halves __attribute__((vector_size(4 * DOUBLES)));
-
 template <class V, class T>
 inline V load(const T *from) {
   V x;
@@ -37,7 +30,6 @@ template <class V, class T>
 inline void store(T *to, V x) {
   std::memcpy(to, &x, sizeof x);
 }
-inline void store_low(uint32_t *to, Longs x) { store(to, __builtin_convertvector(x, Halves)); }
 
 // The integer (two's complement) in a sum to which ROUND was added.
 inline Longs as_int(Doubles rounded) { return (Longs)rounded - (Longs)(Doubles{} + ROUND); }
@@ -50,9 +42,9 @@ struct Slope {
 
 template <bool ramp>
 inline Slope slope(const float *from, const float *to, double share) {
-  const Doubles a = __builtin_convertvector(load<Floats>(from), Doubles) * UNIT + ROUND;
+  const Doubles a = load_doubles(from) * UNIT + ROUND;
   if (!ramp) return {as_int(a), Longs{}, Longs{}, Longs{}, as_int(a)};
-  const Doubles b = __builtin_convertvector(load<Floats>(to), Doubles) * UNIT + ROUND;
+  const Doubles b = load_doubles(to) * UNIT + ROUND;
   const Doubles d = (b - a) * share, half = d * 0.5;
   const Doubles whole = d + ROUND, half_whole = half + ROUND;
   const Longs low = as_int((d - (whole - ROUND)) * UNIT + ROUND);
@@ -69,7 +61,8 @@ struct Pixels {
   alignas(64) int64_t v[PIXELS], d[PIXELS];
   alignas(64) uint32_t v_low[PIXELS], d_low[PIXELS], v_word[PIXELS], d_word[PIXELS];
   alignas(64) uint32_t charge[PIXELS];
-  alignas(64) uint64_t clipped[PIXELS];
+  alignas(64) uint64_t clipped[PIXELS];      // of one stretch of at most TICKS ticks
+  alignas(64) unsigned __int128 lost[PIXELS];  // of all before it
   bool bright[PIXELS / GROUP];  // groups with a pixel at or above one threshold a tick
 
   template <bool ramp>
@@ -157,6 +150,10 @@ struct Pixels {
       }
       std::memcpy(out + t * frame, packed, static_cast<size_t>(std::min(bytes, GROUP / 8)));
     }
+    for (int64_t i = g; i < g + GROUP; ++i) {
+      lost[i] += clipped[i];
+      clipped[i] = 0;
+    }
   }
 };
 
@@ -201,7 +198,7 @@ void fire(const Light &light, uint32_t *charge, uint8_t *bits, double *clipped) 
     }
     each_run([&](int64_t i, int64_t pixel, int64_t n) {
       std::copy_n(state.charge + i, n, charge + pixel);
-      for (int64_t j = 0; j < n; ++j) clipped[pixel + j] = static_cast<double>(state.clipped[i + j]) / UNIT;
+      for (int64_t j = 0; j < n; ++j) clipped[pixel + j] = static_cast<double>(state.lost[i + j]) / UNIT;
     });
   });
 }

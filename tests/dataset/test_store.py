@@ -1,5 +1,6 @@
 """The scene file: exact round trips, honest status, checksums, versions, windows of spikes."""
 
+import json
 import os
 import signal
 import subprocess
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from hard_store import full_scene, path, same, view
 
+from spikerig.dataset.cli import run
 from spikerig.dataset.clocktime import ns_from_tick
 from spikerig.dataset.errors import DataError, HostError, NumericsError, UsageError
 from spikerig.dataset.scene import Camera, Scene
@@ -345,6 +347,14 @@ def test_the_page_of_the_format_is_made_from_the_table() -> None:
     assert schema_markdown() in PAGE.read_text(encoding="utf-8"), (
         "python -m spikerig.dataset.store prints it: paste it into docs/format.md"
     )
+
+
+def test_the_cost_of_a_scene_is_measured(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["cost", "scene", "--views", "1", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["bytes"] > 812 * 250 * 50
+    assert {"write", "open", "41 ticks of a view"} < found["rows"].keys()
+    assert all(row["wall_ms"] > 0 for row in found["rows"].values())
 
 
 def test_paths_given_as_text(tmp_path: Path) -> None:
