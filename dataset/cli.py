@@ -7,10 +7,8 @@ Entry points of the group `spikerig.commands` have dotted names, `noun.verb = "m
 from __future__ import annotations
 
 import sys
-import tempfile
 from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points, version
-from pathlib import Path
 
 import typer
 
@@ -143,6 +141,7 @@ def _tell(record: dict[str, object], text: str, code: int, as_json: bool) -> int
 
 def _bug(error: Exception, argv: list[str], as_json: bool) -> int:
     import platform
+    import tempfile
     import traceback
 
     with tempfile.NamedTemporaryFile(
@@ -152,7 +151,7 @@ def _bug(error: Exception, argv: list[str], as_json: bool) -> int:
         report.write(f"command: {argv!r}\n\n")
         traceback.print_exception(error, file=report)
     what = f"spikerig has a bug here: {type(error).__name__}: {error}"
-    record = {"type": "Bug", "exit_code": 70, "what": what, "report": str(Path(report.name))}
+    record = {"type": "Bug", "exit_code": 70, "what": what, "report": report.name}
     return _tell(record, f"{what}\n  report:   {report.name}", 70, as_json)
 
 

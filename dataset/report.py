@@ -273,7 +273,7 @@ def _page(result: dict[str, Any], pictures: dict[str, dict[str, bytes]]) -> str:
         )
         for name, m in r["methods"].items():
             parts.append(
-                f"<tr><td>{esc(NAMES.get(name, name))}</td><td>{m['psnr']:.2f}</td><td>{m['luma_psnr']:.2f}</td>"
+                f"<tr><td>{esc(str(NAMES.get(name, name)))}</td><td>{m['psnr']:.2f}</td><td>{m['luma_psnr']:.2f}</td>"
                 f"<td>{m['ssim']:.4f}</td><td>{m['steps']}</td><td>{m['train_seconds']:.1f}</td></tr>"
             )
         parts.append(

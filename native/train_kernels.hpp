@@ -19,7 +19,8 @@ namespace spikerig {
 constexpr int TILE = 16;                    // pixels, each way
 constexpr float ALPHA_MAX = 0.99f;          // one splat never takes more of the light than this
 constexpr float ALPHA_MIN = 1.0f / 255.0f;  // below this a splat leaves a pixel untouched
-constexpr float LIGHT_MIN = 1e-4f;          // = (1 - ALPHA_MAX)^2: a pixel with less light left is finished
+constexpr float LIGHT_MIN = 1.1e-4f;        // a pixel with less light left is finished; above (1 - ALPHA_MAX)^2, so
+                                            // that two clipped splats finish it whatever the rounding
 constexpr double DILATION = 0.3;            // pixels^2 added to the covariance of each footprint
 constexpr double COMPENSATION_MIN = 0.005;  // floor of the Mip 2D compensation
 constexpr double CLAMP_MARGIN = 0.3;        // the EWA Jacobian is frozen beyond the picture plus this x half its size

@@ -1,6 +1,7 @@
 """Scene files made to do harm: each function takes the path of a good scene (hard_store.full_scene) and spoils it."""
 
 import os
+import shutil
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -18,11 +19,15 @@ def _swap(path: Path, name: str, make: Callable[[h5py.Group, str], Any]) -> None
 
 
 def external_link(path: Path) -> None:
-    _swap(path, "/views/a/pose", lambda g, n: g.__setitem__(n, h5py.ExternalLink("/etc/passwd", "/x")))
+    """To a pose that is perfectly good, in another file."""
+    other = path.with_name("other.h5")
+    shutil.copy(path, other)
+    _swap(path, "/views/a/pose", lambda g, n: g.__setitem__(n, h5py.ExternalLink(str(other), "/views/a/pose")))
 
 
 def soft_link(path: Path) -> None:
-    _swap(path, "/views/a/pose", lambda g, n: g.__setitem__(n, h5py.SoftLink("/camera/K")))
+    """To a pose that is perfectly good, in the same file."""
+    _swap(path, "/views/a/pose", lambda g, n: g.__setitem__(n, h5py.SoftLink("/views/v-01.x/pose")))
 
 
 def soft_link_to_itself(path: Path) -> None:
@@ -35,14 +40,21 @@ def hard_link_cycle(path: Path) -> None:
 
 
 def virtual_dataset(path: Path) -> None:
+    """Of a pose that is perfectly good, in another file."""
+    other = path.with_name("other.h5")
+    shutil.copy(path, other)
     layout = h5py.VirtualLayout((3, 4), "<f8")
-    layout[:] = h5py.VirtualSource("/etc/passwd", "x", (3, 4))
+    layout[:] = h5py.VirtualSource(str(other), "/views/a/pose", (3, 4))
     _swap(path, "/views/a/pose", lambda g, n: g.create_virtual_dataset(n, layout))
 
 
 def external_storage(path: Path) -> None:
+    """A pose that is perfectly good, in a raw file beside."""
+    raw = path.with_name("raw.bin")
+    raw.write_bytes(np.eye(4)[:3].tobytes())
+
     def make(group: h5py.Group, name: str) -> None:
-        group.create_dataset(name, (3, 4), "<f8", external=[("/etc/passwd", 0, 96)])
+        group.create_dataset(name, (3, 4), "<f8", external=[(str(raw), 0, 96)])
 
     _swap(path, "/views/a/pose", make)
 
@@ -50,6 +62,10 @@ def external_storage(path: Path) -> None:
 def huge_empty_chunks(path: Path) -> None:
     """40 TB claimed, nothing stored."""
     _swap(path, "/views/a/spikes", lambda g, n: g.create_dataset(n, (1 << 40, 13, 3), "|u1", chunks=(1 << 10, 13, 3)))
+
+
+def chunks_never_written(path: Path) -> None:
+    _swap(path, "/views/a/spikes", lambda g, n: g.create_dataset(n, (4000, 13, 3), "|u1", chunks=(1000, 13, 3)))
 
 
 def huge_contiguous(path: Path) -> None:
@@ -235,49 +251,50 @@ def pipe(path: Path) -> None:
     os.mkfifo(path)
 
 
-# What opening and reading everything must end in (a DataError), and what `data verify` says: None means unreadable
-# (exit 4), a text means a finding with it (exit 1).
-HOSTILE: dict[Callable[[Path], None], str | None] = {
-    external_link: None,
-    soft_link: None,
-    soft_link_to_itself: None,
-    hard_link_cycle: None,
-    virtual_dataset: None,
-    external_storage: None,
-    huge_empty_chunks: None,
-    huge_contiguous: None,
-    deflate_bomb: None,
-    text_for_numbers: None,
-    reference_type: None,
-    scalar_for_array: None,
-    unknown_filter: None,
-    endless_text_attribute: None,
-    array_attribute: None,
-    name_that_climbs: None,
-    name_of_the_parent: None,
-    future_major: None,
-    version_of_nonsense: None,
-    another_format: None,
-    not_hdf5: None,
-    empty: None,
-    only_the_signature: None,
-    folder: None,
-    pipe: None,
-    wrong_dtype: "not what the schema says",
-    group_for_dataset: "not the f8 that belongs there",
-    missing_dataset: "pose is missing",
-    missing_camera: "camera is missing",
-    missing_attribute: "start_ns is missing",
-    text_attribute_for_number: "where int belongs",
-    camera_of_another_size: "not those that were written",
-    mirrored_pose: "not those that were written",
-    pose_of_nan: "not finite",
-    lost_beyond_the_end: "not those that were written",
-    lost_backwards: "not those that were written",
-    padding_bits: "not those that were written",
-    width_beyond_the_row: "not those that were written",
-    info_not_json: "not those that were written",
-    info_nested_deep: "not those that were written",
-    name_with_dots: "not those that were written",
-    name_of_a_device: "not those that were written",
+# `spikerig data verify` exits 4 (unreadable) or 1 (findings), and these words stand in its error or in a finding.
+# Opening and reading everything is one DataError either way, of the same words where verifying is.
+HOSTILE: dict[Callable[[Path], None], tuple[int, str]] = {
+    external_link: (4, "only hard links are followed"),
+    soft_link: (4, "only hard links are followed"),
+    soft_link_to_itself: (4, "only hard links are followed"),
+    hard_link_cycle: (4, "one object under two names"),
+    virtual_dataset: (4, "its data lie in other files"),
+    external_storage: (4, "its data lie in other files"),
+    huge_empty_chunks: (4, "claims 42880953483264 bytes"),
+    chunks_never_written: (4, "0 of 4 chunks are there"),
+    huge_contiguous: (4, "claims 42880953483264 bytes"),
+    deflate_bomb: (4, "claims 2147483648 bytes"),
+    text_for_numbers: (4, "only integers and floats are read"),
+    reference_type: (4, "only integers and floats are read"),
+    scalar_for_array: (4, "a scalar or null dataspace"),
+    unknown_filter: (4, "allowed are ['deflate', 'fletcher32', 'shuffle']"),
+    endless_text_attribute: (4, "not one number or short text"),
+    array_attribute: (4, "not one number or short text"),
+    name_that_climbs: (4, "not a plain one: '../../xy'"),
+    name_of_the_parent: (4, "not a plain one: '..'"),
+    future_major: (4, "RS-3D 2.0"),
+    version_of_nonsense: (4, "version '1.0; rm -rf /'"),
+    another_format: (4, "an HDF5 file of another kind"),
+    not_hdf5: (4, "does not begin as HDF5 does"),
+    empty: (4, "it is empty"),
+    only_the_signature: (4, "HDF5:"),
+    folder: (4, "not a file"),
+    pipe: (4, "not a file"),
+    wrong_dtype: (1, "not what the schema says"),
+    group_for_dataset: (1, "not the f8 that belongs there"),
+    missing_dataset: (1, "pose is missing"),
+    missing_camera: (1, "camera is missing"),
+    missing_attribute: (1, "start_ns is missing"),
+    text_attribute_for_number: (1, "where int belongs"),
+    camera_of_another_size: (1, "not those that were written"),
+    mirrored_pose: (1, "not those that were written"),
+    pose_of_nan: (1, "not finite"),
+    lost_beyond_the_end: (1, "not those that were written"),
+    lost_backwards: (1, "not those that were written"),
+    padding_bits: (1, "not those that were written"),
+    width_beyond_the_row: (1, "not those that were written"),
+    info_not_json: (1, "not those that were written"),
+    info_nested_deep: (1, "not those that were written"),
+    name_with_dots: (1, "not those that were written"),
+    name_of_a_device: (1, "not those that were written"),
 }

@@ -5,7 +5,7 @@ The kernels' definitions, in float64, are in oracles.py under the same names.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -79,7 +79,7 @@ def camera_block(
             value=f"K {list(k.shape)}, cam_from_world {list(pose.shape)}, background {list(light.shape)}",
             expected="K [3, 3], cam_from_world [3, 4], background [3]",
         )
-    refuse_not_finite({"K": k, "cam_from_world": pose, "background": light, "near": np.float64([near])})
+    refuse_not_finite({"K": k, "cam_from_world": pose, "background": light, "near": np.asarray([near], np.float64)})
     if k[0, 0] <= 0 or k[1, 1] <= 0 or k[0, 1] != 0 or k[1, 0] != 0 or tuple(k[2]) != (0, 0, 1):
         raise UsageError(
             "K is not a pinhole without skew",
@@ -123,7 +123,11 @@ def render_forward(
     image = np.empty((height, width, 3), np.float32)
     alpha = np.empty((height, width), np.float32)
     radii = np.empty(len(arrays[3]), np.float32)
-    state = _native.render_forward(*arrays, camera, width, height, sh_degree, antialias, image, alpha, radii)
+    means, quats, log_scales, logits, sh = arrays
+    made = _native.render_forward(
+        means, quats, log_scales, logits, sh, camera, width, height, sh_degree, antialias, image, alpha, radii
+    )
+    state = cast("_native.Render | None", made)
     if state is None:
         refuse_not_finite(dict(zip(TENSORS, arrays, strict=True)))
         raise NumericsError(
@@ -146,10 +150,13 @@ def render_backward(
         (gradients of the five arrays; of the screen positions [N,2], in loss per pixel; of cam_from_world [3,4],
         float64).
     """
-    grads = [np.empty_like(a) for a in arrays]
-    screen = np.empty((len(arrays[3]), 2), np.float32)
-    camera = np.empty(12, np.float64)
-    _native.render_backward(state, *arrays, image_grad, alpha_grad, *grads, screen, camera)
+    means, quats, log_scales, logits, sh = arrays
+    g_means, g_quats, g_log_scales, g_logits, g_sh = grads = [np.empty_like(a) for a in arrays]
+    screen, camera = np.empty((len(logits), 2), np.float32), np.empty(12, np.float64)
+    _native.render_backward(
+        state, means, quats, log_scales, logits, sh, image_grad, alpha_grad,
+        g_means, g_quats, g_log_scales, g_logits, g_sh, screen, camera,
+    )  # fmt: skip
     return grads, screen, camera.reshape(3, 4)
 
 

@@ -12,11 +12,11 @@ from typing import Any
 
 import torch
 
-from .splat import Splats
+from spikerig.train.splat import Splats
 
 ALPHA_MAX = 0.99  # one splat never takes more of the light than this
 ALPHA_MIN = 1 / 255  # below this a splat leaves a pixel untouched
-LIGHT_MIN = 1e-4  # a pixel with less light left is finished
+LIGHT_MIN = 1.1e-4  # a pixel with less light left is finished; a little above (1 - ALPHA_MAX)^2
 DILATION = 0.3  # pixels^2
 COMPENSATION_MIN = 0.005
 CLAMP_MARGIN, CULL_MARGIN = 0.3, 1.0  # of half the picture, beyond its border

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch.autograd.function import once_differentiable
 
 from spikerig.dataset.errors import UsageError
-
-from . import kernels
+from spikerig.train import kernels
 
 SH_ROWS = {1: 0, 4: 1, 9: 2, 16: 3}  # stored coefficients -> degree
 
@@ -85,11 +85,12 @@ class _Render(torch.autograd.Function):
         return out
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, image_grad: Any, alpha_grad: Any, _radii: Any) -> Any:  # type: ignore[override]
         width, height = ctx.state.width, ctx.state.height
         shapes = ((image_grad, (height, width, 3)), (alpha_grad, (height, width)))
-        wanted = [np.zeros(size, np.float32) if g is None else g.contiguous().numpy() for g, size in shapes]
-        grads, screen, camera = kernels.render_backward(ctx.state, _arrays(ctx.saved_tensors), *wanted)
+        by_image, by_alpha = (np.zeros(size, np.float32) if g is None else g.contiguous().numpy() for g, size in shapes)
+        grads, screen, camera = kernels.render_backward(ctx.state, _arrays(ctx.saved_tensors), by_image, by_alpha)
         dtype, device = ctx.pose
         pose_grad = torch.from_numpy(camera).to(device, dtype)
         return None, torch.from_numpy(screen), pose_grad, *(torch.from_numpy(g) for g in grads)
@@ -134,8 +135,8 @@ def render(
         NumericsError: a parameter is not finite; names tensor and index.
 
     Edges: no splats or none visible gives the background and alpha 0. A splat leaves a pixel untouched where its
-        alpha < 1/255; alpha is at most 0.99 (no gradient where clipped); a pixel is finished when less than 1e-4 of
-        the light is left. Splats of equal float32 depth keep their order. Same bits for any thread count.
+        alpha < 1/255; alpha is at most 0.99 (no gradient where clipped); a pixel is finished when less than 1.1e-4
+        of the light is left. Splats of equal float32 depth keep their order. Same bits for any thread count.
     Cost: measured by `spikerig cost kernels`.
     Source: Kerbl et al. 2023; Zwicker et al. 2001 (EWA); Yu et al. 2024 (Mip-Splatting, 2D filter).
     """

@@ -6,20 +6,20 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch.autograd.function import once_differentiable
 
 from spikerig.dataset.errors import UsageError
-
-from . import kernels
+from spikerig.train import kernels
 
 
 class _L1Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: torch.Tensor, target: torch.Tensor, valid: Any, weight: float) -> torch.Tensor:
-        arrays = [kernels.array(name, x, tuple(target.shape)) for name, x in (("image", image), ("target", target))]
-        loss, ctx.grad = kernels.l1_ssim(*arrays, valid, weight, grad=ctx.needs_input_grad[0])
+        loss, ctx.grad = kernels.l1_ssim(*_arrays(image, target), valid, weight, grad=ctx.needs_input_grad[0])
         return torch.tensor(loss, dtype=torch.float32)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, grad: torch.Tensor) -> Any:  # type: ignore[override]
         return torch.from_numpy(ctx.grad) * grad, None, None, None
 
@@ -74,8 +74,12 @@ def ssim(image: torch.Tensor, target: torch.Tensor) -> float:
         UsageError: a shape or type does not fit.
     """
     _check(image, target)
-    arrays = [kernels.array(name, x, tuple(target.shape)) for name, x in (("image", image), ("target", target))]
-    return 1.0 - kernels.l1_ssim(*arrays, None, 1.0, grad=False)[0]
+    return 1.0 - kernels.l1_ssim(*_arrays(image, target), None, 1.0, grad=False)[0]
+
+
+def _arrays(image: torch.Tensor, target: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+    shape = tuple(target.shape)
+    return kernels.array("image", image, shape), kernels.array("target", target, shape)
 
 
 def _check(image: torch.Tensor, target: torch.Tensor) -> None:

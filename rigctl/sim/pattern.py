@@ -25,6 +25,7 @@ class Texture:
         size: edge of a cell or the period, in world units.
         a, b: linear reflectances (r, g, b).
         luma, chroma: ranges of a tile's luma (Rec.601 of linear light) and chroma; hue is uniform.
+        tint: multiplies all of it (r, g, b): tiles and patterns of one hue.
         spokes: pairs of the star.
         seed: of tiles and noise; the world does not change with the scene's seed.
         emit: light given off, as a multiple of the albedo; > 0 makes a lamp (HDR when the product exceeds 1).
@@ -36,6 +37,7 @@ class Texture:
     b: tuple[float, float, float] = limits((0.1, 0.1, 0.1), 0, 1)
     luma: tuple[float, float] = limits((0.15, 0.75), 0, 1)
     chroma: tuple[float, float] = limits((0.0, 0.1), 0, 1)
+    tint: tuple[float, float, float] = limits((1.0, 1.0, 1.0), 0, 1)
     angle_deg: float = limits(0.0, -360, 360, "degrees")
     spokes: int = limits(18, 1, 1000)
     seed: int = limits(0, 0, 2**32 - 1)
@@ -57,7 +59,7 @@ def lattice(texture: Texture) -> Floats:
     red, blue = chroma * np.cos(hue), chroma * np.sin(hue)
     offset = np.stack([red, -(0.299 * red + 0.114 * blue) / 0.587, blue])
     room = np.where(offset > 0, (1 - luma) / np.maximum(offset, 1e-9), luma / np.maximum(-offset, 1e-9)).min(0)
-    return (luma + offset * np.minimum(room, 1)).astype(np.float32)
+    return ((luma + offset * np.minimum(room, 1)) * np.array(texture.tint)[:, None]).astype(np.float32)
 
 
 def albedo(texture: Texture, table: Floats, u: Floats, v: Floats) -> Floats:
@@ -75,14 +77,14 @@ def albedo(texture: Texture, table: Floats, u: Floats, v: Floats) -> Floats:
         About 10 ns a point for tiles, less for the plain kinds.
     """
     if texture.kind == "plain":
-        return np.broadcast_to(np.array(texture.a, np.float32)[:, None], (3, u.size))
+        return np.broadcast_to((np.array(texture.a) * texture.tint).astype(np.float32)[:, None], (3, u.size))
     if texture.kind == "tiles":
         return np.take(table, _cell(u, v, texture.size), axis=1)
     return _mix(texture, _weight(texture, table, u, v))
 
 
 def _mix(texture: Texture, weight: Floats) -> Floats:
-    a, b = np.array(texture.a, np.float32), np.array(texture.b, np.float32)
+    a, b = ((np.array(c) * texture.tint).astype(np.float32) for c in (texture.a, texture.b))
     return b[:, None] + (a - b)[:, None] * weight[None]
 
 

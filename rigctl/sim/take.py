@@ -216,15 +216,13 @@ def pack(
     effects = {effect.name: parameters(effect) for effect in rig.effects}
     truth = Truth({}, {}, {}, ClockModel.identity(), effects, rig.seed, rig.exposure.label)
     told: list[Taken] = []
-    with SceneWriter(path, rig.name, rig.camera, light_gain=rig.light_gain, info=info, truth=truth, force=force) as out:
-        try:
-            for taken in takes:
-                out.add(taken.view, light=taken.light, at_ns=taken.at_ns, trajectory=taken.trajectory)
-                told.append(replace(taken, view=replace(taken.view, spikes=None)))
-                done(taken)
-        except BaseException:
-            out.abort(keep=False)  # it can be made again
-            raise
+    more = {"light_gain": rig.light_gain, "info": info, "truth": truth}
+    # keep=False: what a simulation left half done can be made again
+    with SceneWriter(path, rig.name, rig.camera, **more, force=force, keep=False) as out:
+        for taken in takes:
+            out.add(taken.view, light=taken.light, at_ns=taken.at_ns, trajectory=taken.trajectory)
+            told.append(replace(taken, view=replace(taken.view, spikes=None)))
+            done(taken)
         if points is None:
             xyz, rgb = (np.concatenate([getattr(t.points, key) for t in told]) for key in ("xyz", "rgb"))
             points = Points(xyz, rgb, "simulator")

@@ -168,8 +168,9 @@ def test_a_corrupt_png_is_found_by_its_checksums(tmp_path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
-    with pytest.raises(DataError, match="damaged"):
+    with pytest.raises(DataError, match="damaged") as told:
         read_image(path)
+    assert "corrupt at byte" in told.value.cause, "found before any decoder saw it"
 
 
 def test_claimed_sizes_are_checked_before_anything_is_decoded(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """The torch Dataset over a scene: what an item holds, in this process, in workers, and after pickling."""
 
+import os
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -87,6 +88,14 @@ def test_workers_give_the_same_items(file: Path, start: str) -> None:
     for a, b in zip(here, there, strict=True):
         assert a.keys() == b.keys()
         assert all(torch.equal(a[k], b[k]) for k in a if k != "name")
+
+
+def test_another_process_opens_the_file_anew(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = SceneDataset(file)
+    opened = data._scene()
+    assert data._scene() is opened
+    monkeypatch.setattr(os, "getpid", lambda: -1)  # as after a fork
+    assert data._scene() is not opened
 
 
 def test_it_pickles_without_its_open_file_and_collates(file: Path) -> None:
