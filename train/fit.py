@@ -43,13 +43,17 @@ CHECK_EVERY = 50  # steps between looks for values that are not finite
 
 @dataclass(slots=True, eq=False)
 class State:
-    """What a fit changes: parameters by name, Adam, the next step, seconds trained, held-out dB over time."""
+    """What a fit changes: parameters by name, Adam, the next step, seconds trained, held-out dB over time.
+
+    `memory` holds the last renders (float16 codes [H,W,3]) of sub-poses by (view, phase), where fresh_poses asks.
+    """
 
     params: dict[str, Tensor]
     optimiser: torch.optim.Adam
     step: int = 0
     seconds: float = 0.0
     history: list[dict[str, Any]] = field(default_factory=list)
+    memory: dict[tuple[str, float], Tensor] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -163,20 +167,25 @@ def view_loss(state: State, task: Task, view: TrainView, fraction: float, rng: n
     model = task.model(state.params)
 
     def draw(phase: float) -> Tensor:
-        return model.draw(view.instants[phase].pose, background, degree).image
+        image = model.draw(view.instants[phase].pose, background, degree).image
+        if config.fresh_poses > 0:
+            state.memory[view.name, phase] = image.detach().half()
+        return image
 
     if fraction < config.ratio_until:
         phase = targets.ratio[rng.integers(len(targets.ratio))]
         pictures = {phase: draw(phase)}
         loss = colour_loss(pictures[phase], view.instants[phase].ratio.float(), view.valid, config)
-        supervised: tuple[float, ...] = (phase,)
     else:
-        supervised = targets.tfs
-        pictures = {phase: draw(phase) for phase in dict.fromkeys((*targets.colour, *supervised))}
-        exposed = average_exposure([pictures[phase] for phase in targets.colour])
-        loss = colour_loss(exposed, view.frame, view.valid, config)
+        fresh = _fresh(state, task, view, rng)
+        pictures = {phase: draw(phase) for phase in fresh}
+        exposed = average_exposure(
+            [pictures[p] if p in pictures else state.memory[view.name, p].float() for p in targets.colour]
+        )
+        share = len(targets.colour) / max(1, len([p for p in targets.colour if p in pictures]))
+        loss = share * colour_loss(exposed, view.frame, view.valid, config)
     if task.weight > 0:
-        loss = loss + task.weight * _tfs_term(state, task, view, {p: pictures[p] for p in supervised})
+        loss = loss + task.weight * _tfs_term(state, task, view, pictures)
     if config.opacity_reg > 0:
         loss = loss + config.opacity_reg * torch.sigmoid(state.params["logit_opacities"]).mean()
     if config.scale_reg > 0:
@@ -184,14 +193,25 @@ def view_loss(state: State, task: Task, view: TrainView, fraction: float, rng: n
     return loss
 
 
+def _fresh(state: State, task: Task, view: TrainView, rng: np.random.Generator) -> list[float]:
+    """The instants to render in a step: all, or `fresh_poses` random ones and those never rendered before."""
+    wanted = list(dict.fromkeys((*task.targets.colour, *task.targets.tfs)))
+    k = task.config.fresh_poses
+    if k == 0 or k >= len(wanted):
+        return wanted
+    chosen = {wanted[i] for i in rng.choice(len(wanted), k, replace=False)}
+    return [p for p in wanted if p in chosen or (view.name, p) not in state.memory]
+
+
 def _tfs_term(state: State, task: Task, view: TrainView, pictures: dict[float, Tensor]) -> Tensor:
     gray = state.params.get("gray", task.gray)
+    supervised = [phase for phase in pictures if view.instants[phase].textures]
     terms = [
-        tfs_loss(picture, texture, weight, gray, task.config.tfs_domain)
-        for phase, picture in pictures.items()
+        tfs_loss(pictures[phase], texture, weight, gray, task.config.tfs_domain)
+        for phase in supervised
         for texture, weight in view.instants[phase].textures
     ]
-    return torch.stack(terms).sum() / len(pictures)
+    return torch.stack(terms).sum() / len(supervised) if terms else torch.zeros(())
 
 
 def colour_loss(image: Tensor, target: Tensor, valid: Tensor | None, config: FitConfig) -> Tensor:
@@ -266,6 +286,7 @@ def save_state(path: Path, state: State, config: FitConfig) -> None:
     for name, p in state.params.items():
         for key, value in state.optimiser.state.get(p, {}).items():
             tensors[f"adam/{name}/{key}"] = value
+    tensors |= {f"memory/{view}/{phase!r}": image for (view, phase), image in state.memory.items()}
     record = {"step": state.step, "seconds": state.seconds, "history": state.history, "config": config.as_json()}
     checkpoint.save(path, tensors, record)
 
@@ -279,4 +300,8 @@ def load_state(path: Path) -> tuple[State, dict[str, Any]]:
         found = {k.split("/")[2]: v for k, v in tensors.items() if k.startswith(f"adam/{name}/")}
         if found:
             state.optimiser.state[p] = found
+    for name, image in tensors.items():
+        if name.startswith("memory/"):
+            _, view, phase = name.split("/")
+            state.memory[view, float(phase)] = image
     return state, record["config"]
