@@ -110,6 +110,8 @@ def test_the_lit_side_of_a_box_is_the_one_to_the_lamp() -> None:
         stage, camera = Stage(world), Camera.pinhole(5, 5, 10)
         lit, dark = (orbit_pose(Orbit(views=1, start_deg=a, radius=3.0, height=0.0), 0) for a in (180, 0))
         assert stage.picture(camera, lit, 1).min() > 0.3
+        if yaw == 0:
+            assert stage.picture(camera, lit, 1)[2, 2, 0] == pytest.approx(0.1 + 9 / 3.5**2, rel=1e-3)
         assert np.allclose(stage.picture(camera, dark, 1), 0.1)
 
 
