@@ -115,7 +115,12 @@ def _silhouette_points(plan: Plan) -> Points | None:
     rgba = [read_image(picture) for _, picture in progress(train, "reading silhouettes", "picture")]
     if any(picture.dtype != np.uint8 for picture in rgba):
         return None
-    return hull_points(plan.camera, [plan.posed.poses[name] for name, _ in train], rgba)
+    try:
+        return hull_points(plan.camera, [plan.posed.poses[name] for name, _ in train], rgba)
+    except DataError as error:  # points are a starting guess: a scene without them is a scene
+        note(f"no points: {error.what}")
+        plan.notes.append(f"no points: {error.what}")
+        return None
 
 
 def plan_scene(config: BuildConfig) -> Plan:

@@ -218,7 +218,7 @@ def _check_chunks(dataset: h5py.Dataset, size: int, filtered: bool, end: int) ->
     step = math.prod(chunk) * dataset.id.get_type().get_size()
     need = math.prod(-(-n // c) for n, c in zip(shape, chunk, strict=True))
     held = dataset.id.get_storage_size()
-    if step > MAX_CHUNK or need > end or size > (max(MAX_CHUNK, held * MAX_INFLATION) if filtered else held):
+    if step > MAX_CHUNK or need > end or (filtered and size > max(MAX_CHUNK, held * MAX_INFLATION)):
         raise refuse(
             spot(dataset), f"claims {size} bytes of shape {shape} in chunks of {chunk} from {held} bytes stored"
         )

@@ -31,7 +31,7 @@ def hull_points(
     Raises:
         DataError: nothing lies inside all silhouettes (wrong poses, or empty alpha).
 
-    Edges: a point outside a picture's field of view is not judged by that picture.
+    Edges: a point outside a picture's field of view is not judged by that picture; at least half must judge it.
     Cost: `count` / (share of the volume that is inside) projections a picture; seconds for 100 pictures.
     """
     centre, half = _common_volume(camera, poses)
@@ -81,5 +81,5 @@ def _inside(
         total += np.where(within[:, None], pixel[:, :3], 0)
         seen += within
         xyz, total, seen = xyz[keep], total[keep], seen[keep]
-    judged = seen > 0
+    judged = 2 * seen >= len(poses)  # what few pictures frame is not carved out by them
     return xyz[judged], total[judged] / seen[judged, None]

@@ -188,7 +188,7 @@ def adaptive_windows(
     lost = stream.lost_before()
     shape = (stream.height, stream.width)
     light, chosen = np.zeros(shape), np.zeros(shape, np.int32)
-    low, high, growing = np.full(shape, -np.inf), np.full(shape, np.inf), np.ones(shape, bool)
+    low, high = np.full(shape, -np.inf), np.full(shape, np.inf)
     for window in windows:
         t0, t1 = (min(max(t, 0), stream.ticks) for t in tfp_window(at, window))
         if t0 == t1 or lost[t0] != lost[t1]:
@@ -196,7 +196,7 @@ def adaptive_windows(
         mean = window_sum(stream, t0, t1) / (t1 - t0)
         np.maximum(low, mean - margin / (t1 - t0), out=low)
         np.minimum(high, mean + margin / (t1 - t0), out=high)
-        growing &= low <= high
+        growing = low <= high  # once apart, the ranges stay apart
         light[growing], chosen[growing] = mean[growing], window
     return light, chosen, chosen > 0
 

@@ -47,7 +47,8 @@ class Render {
 
 spikerig::Splats splats_of(In means, In quats, In log_scales, In logits, In sh) {
   int64_t n = static_cast<int64_t>(logits.size());
-  expect(means.size() == size_t(3 * n) && quats.size() == size_t(4 * n) && log_scales.size() == size_t(3 * n), "splats");
+  expect(means.size() == size_t(3 * n) && quats.size() == size_t(4 * n) && log_scales.size() == size_t(3 * n),
+         "splats");
   expect(sh.ndim() == 3 && int64_t(sh.shape(0)) == n && sh.shape(2) == 3, "sh");
   return {means.data(), quats.data(), log_scales.data(), logits.data(), sh.data(), n, static_cast<int>(sh.shape(1))};
 }
@@ -93,11 +94,13 @@ void render_backward(Render &render, In means, In quats, In log_scales, In logit
                      Out g_means2d, OutDouble g_camera) {
   spikerig::Frame &f = *render.frame;
   size_t pixels = size_t(f.camera.width) * f.camera.height, n = static_cast<size_t>(f.splats.n);
-  f.splats = splats_of(means, quats, log_scales, logits, sh);
-  expect(size_t(f.splats.n) == n && g_means.size() == 3 * n && g_quats.size() == 4 * n && g_log_scales.size() == 3 * n &&
-             g_logits.size() == n && g_sh.size() == sh.size() && g_means2d.size() == 2 * n && g_camera.size() == 12,
+  const spikerig::Splats splats = splats_of(means, quats, log_scales, logits, sh);
+  expect(size_t(splats.n) == n && splats.sh_rows == f.splats.sh_rows && g_means.size() == 3 * n &&
+             g_quats.size() == 4 * n && g_log_scales.size() == 3 * n && g_logits.size() == n &&
+             g_sh.size() == sh.size() && g_means2d.size() == 2 * n && g_camera.size() == 12,
          "gradients");
   expect(image_grad.size() == 3 * pixels && alpha_grad.size() == pixels, "pictures");
+  f.splats = splats;
   f.image_grad = image_grad.data();
   f.alpha_grad = alpha_grad.data();
   nb::gil_scoped_release release;

@@ -72,7 +72,9 @@ void count_by_tile(const Frame &f, const Rect *rects, uint32_t *start) {
   for (int y = 0; y < f.tiles_y; ++y)
     for (int x = 0; x < f.tiles_x; ++x) {
       int32_t &here = c[y * wide + x];
-      here += (x ? c[y * wide + x - 1] : 0) + (y ? c[(y - 1) * wide + x] : 0) - (x && y ? c[(y - 1) * wide + x - 1] : 0);
+      if (x) here += c[y * wide + x - 1];
+      if (y) here += c[(y - 1) * wide + x];
+      if (x && y) here -= c[(y - 1) * wide + x - 1];
       start[y * f.tiles_x + x + 1] = start[y * f.tiles_x + x] + static_cast<uint32_t>(here);
     }
 }
@@ -163,7 +165,8 @@ int64_t consulted(const Frame &f) {
     for (int y = y0; y < y0 + TILE && y < f.camera.height; ++y)
       for (int x = x0; x < x0 + TILE && x < f.camera.width; ++x) {
         float light = 1;
-        for (uint32_t k = f.tile_start.data[tile]; k < f.tile_start.data[tile + 1] && light >= LIGHT_MIN; ++k, ++total) {
+        const uint32_t end = f.tile_start.data[tile + 1];
+        for (uint32_t k = f.tile_start.data[tile]; k < end && light >= LIGHT_MIN; ++k, ++total) {
           const Footprint &p = f.footprints.data[f.list.data[k].splat];
           float dx = static_cast<float>(x + 0.5 - p.x), dy = static_cast<float>(y + 0.5 - p.y);
           float u = p.p * dx + p.r * dy, v = p.s * dy;

@@ -64,6 +64,10 @@ def huge_empty_chunks(path: Path) -> None:
     _swap(path, "/views/a/spikes", lambda g, n: g.create_dataset(n, (1 << 40, 13, 3), "|u1", chunks=(1 << 10, 13, 3)))
 
 
+def chunks_never_written(path: Path) -> None:
+    _swap(path, "/views/a/spikes", lambda g, n: g.create_dataset(n, (4000, 13, 3), "|u1", chunks=(1000, 13, 3)))
+
+
 def huge_contiguous(path: Path) -> None:
     """40 TB claimed in one piece that was never written."""
     _swap(path, "/views/a/spikes", lambda g, n: g.create_dataset(n, (1 << 40, 13, 3), "|u1"))
@@ -257,6 +261,7 @@ HOSTILE: dict[Callable[[Path], None], tuple[int, str]] = {
     virtual_dataset: (4, "its data lie in other files"),
     external_storage: (4, "its data lie in other files"),
     huge_empty_chunks: (4, "claims 42880953483264 bytes"),
+    chunks_never_written: (4, "0 of 4 chunks are there"),
     huge_contiguous: (4, "claims 42880953483264 bytes"),
     deflate_bomb: (4, "claims 2147483648 bytes"),
     text_for_numbers: (4, "only integers and floats are read"),

@@ -62,8 +62,9 @@ def renderer(device: str) -> Callable[..., Rendered]:
     """The rasteriser of a device: the native one, or gsplat on CUDA (extra `cuda`)."""
     if device == "cpu":
         return render
-    from spikerig.train.cuda import render_cuda
+    from spikerig.train.cuda import check_cuda, render_cuda
 
+    check_cuda()
     return render_cuda
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from .splat import Splats
+from spikerig.train.splat import Splats
 
 ALPHA_MAX = 0.99  # one splat never takes more of the light than this
 ALPHA_MIN = 1 / 255  # below this a splat leaves a pixel untouched

@@ -11,8 +11,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from spikerig.dataset.errors import UsageError
-
-from . import kernels
+from spikerig.train import kernels
 
 SH_ROWS = {1: 0, 4: 1, 9: 2, 16: 3}  # stored coefficients -> degree
 

@@ -9,8 +9,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from spikerig.dataset.errors import UsageError
-
-from . import kernels
+from spikerig.train import kernels
 
 
 class _L1Ssim(torch.autograd.Function):

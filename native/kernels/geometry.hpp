@@ -35,8 +35,9 @@ struct Limits {  // of eye.xy / eye.z
 inline Limits limits(const Camera &c) {
   double half_x = 0.5 * c.width / c.fx, half_y = 0.5 * c.height / c.fy;
   double x0 = -c.cx / c.fx, x1 = (c.width - c.cx) / c.fx, y0 = -c.cy / c.fy, y1 = (c.height - c.cy) / c.fy;
-  return {x0 - CLAMP_MARGIN * half_x, x1 + CLAMP_MARGIN * half_x, y0 - CLAMP_MARGIN * half_y, y1 + CLAMP_MARGIN * half_y,
-          x0 - CULL_MARGIN * half_x,  x1 + CULL_MARGIN * half_x,  y0 - CULL_MARGIN * half_y,  y1 + CULL_MARGIN * half_y};
+  const double clamp_x = CLAMP_MARGIN * half_x, clamp_y = CLAMP_MARGIN * half_y;
+  const double cull_x = CULL_MARGIN * half_x, cull_y = CULL_MARGIN * half_y;
+  return {x0 - clamp_x, x1 + clamp_x, y0 - clamp_y, y1 + clamp_y, x0 - cull_x, x1 + cull_x, y0 - cull_y, y1 + cull_y};
 }
 
 inline vd clamped(vd x, double low, double high) { return smaller(larger(x, splat(low)), splat(high)); }

@@ -1,7 +1,7 @@
 // One tile of the picture, forward and backward. Oracle: train/oracles.py raster.
 //
-// A vector is a block of pixels, 4 wide and LANES / 4 tall; a tile is 4 blocks wide. Each splat of the tile's list, front
-// to back, visits the blocks its box meets: light T and colour live in the tile, the splat's sums in registers.
+// A vector is a block of pixels, 4 wide and LANES / 4 tall; a tile is 4 blocks wide. Each splat of the tile's list
+// visits the blocks its rim meets: light T and colour live in the tile, the splat's sums in registers.
 #include "../train_kernels.hpp"
 #include "float_lanes.hpp"
 
@@ -76,7 +76,8 @@ template <class Visit>
 inline void each_pixel(const Frame &f, const Corner &c, Visit visit) {  // visit(lane in the tile, pixel in the picture)
   for (int y = 0; y < c.tall; ++y)
     for (int x = 0; x < c.wide; ++x)
-      visit((y / TALL * 4 + x / 4) * LANES + y % TALL * 4 + x % 4, static_cast<int64_t>(c.y + y) * f.camera.width + c.x + x);
+      visit((y / TALL * 4 + x / 4) * LANES + y % TALL * 4 + x % 4,
+            static_cast<int64_t>(c.y + y) * f.camera.width + c.x + x);
 }
 
 }  // namespace

@@ -103,6 +103,10 @@ inline void similarity(const SsimPlan &p, const Window &w, const Ring &ring, int
   *sum += sum_lanes(total);
 }
 
+inline float *blurred_row(const SsimPlan &p, int partial, int y) {
+  return p.blurred + (static_cast<size_t>(partial) * p.height + y) * p.stride;
+}
+
 inline double absolute(const float *a, const float *b, int n) {
   vf total{};
   for (int i = 0; i < n; i += LANES) {
@@ -145,7 +149,7 @@ void ssim_band(const SsimPlan &p, int band, float *scratch, double *sums) {
     weights(p, done, weight);
     similarity(p, w, ring, at + 1 < TAPS ? at + 1 : 0, weight, partial, &sums[1]);
     for (int f = 0; p.grad && f < 3; ++f)
-      blur_row(w, partial[f] + ROW_PAD, p.blurred + (static_cast<size_t>(f) * p.height + done) * p.stride, n);
+      blur_row(w, partial[f] + ROW_PAD, blurred_row(p, f, done), n);
   }
 }
 
@@ -160,7 +164,7 @@ void ssim_band_back(const SsimPlan &p, int band) {
       vf sum[3] = {};
       for (int f = 0; f < 3; ++f)
         for (int from = first; from <= last; ++from)
-          sum[f] += w.tap[from - y + HALF] * load(p.blurred + (static_cast<size_t>(f) * p.height + from) * p.stride + i);
+          sum[f] += w.tap[from - y + HALF] * load(blurred_row(p, f, from) + i);
       const int count = n - i < LANES ? n - i : LANES;
       float tail[3][LANES] = {};  // image, target, gradient; the pictures have no padding to read or write
       __builtin_memcpy(tail[0], p.image + row + i, count * sizeof(float));

@@ -41,7 +41,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def config(folder: Path, **more: Any) -> BuildConfig:
-    return BuildConfig(folder / "spikes", folder / "rgb", **{"transforms": folder / "t.json"} | more)
+    return BuildConfig(**{"rgb": folder / "rgb", "spikes": folder / "spikes", "transforms": folder / "t.json"} | more)
 
 
 def test_folders_become_a_scene(folder: Path) -> None:
@@ -171,6 +171,60 @@ def test_deep_and_linear_pictures_become_8_bit_srgb(folder: Path) -> None:
         np.testing.assert_array_equal(scene.view("r_10").frame.pixels, np.repeat(gray, 3, 2))
 
 
+def test_pictures_alone_make_a_scene_of_a_stated_size(folder: Path) -> None:
+    for i, stem in enumerate(STEMS):
+        write_image(folder / "rgb" / f"{stem}.png", pixels_of(i, 2 * H, 2 * W), force=True)
+    made = build_scene(config(folder, spikes=None, size=(W, H), test_every=1), folder / "s.h5")
+    assert (made["train"], len(made["test"])) == ([], 5)
+    with open_scene(folder / "s.h5") as scene:
+        view = scene.view("r_2")
+        assert (view.spikes, view.frame.exposure_ns, view.frame.pixels.shape) == (None, 0, (H, W, 3))
+        assert scene.camera.K[0, 0] == pytest.approx(W / 2 / np.tan(0.4))
+
+
+def silhouettes(folder: Path, radius: float) -> None:
+    """Cameras 4 from the origin around it, looking at it; alpha is a disc, the outline of a ball at the origin."""
+    frames = []
+    for i, stem in enumerate(STEMS):
+        a = 2 * np.pi * i / len(STEMS)
+        back = np.array([np.sin(a), 0, np.cos(a)])  # OpenGL: z points away from what is seen
+        right = np.cross([0, 1, 0], back)
+        matrix = np.eye(4)
+        matrix[:3, :] = np.stack([right, [0, 1, 0], back, 4 * back], 1)
+        frames.append({"file_path": stem, "transform_matrix": matrix.tolist()})
+        y, x = np.mgrid[0:H, 0:W] + 0.5
+        f = W / 2 / np.tan(0.4)
+        disc = np.hypot(x - W / 2, y - H / 2) < f * radius / np.sqrt(16 - radius**2)
+        rgba = np.dstack([np.full((H, W), 200), np.full((H, W), 90), np.full((H, W), i), disc * 255])
+        write_image(folder / "rgb" / f"{stem}.png", rgba.astype(np.uint8), force=True)
+    (folder / "t.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
+
+
+def test_silhouettes_give_points_within_them(folder: Path) -> None:
+    silhouettes(folder, 0.8)
+    build_scene(config(folder, background=0.0), folder / "s.h5")
+    with open_scene(folder / "s.h5") as scene:
+        points, f = scene.points, scene.camera.K[0, 0]
+        poses = [scene.view(stem, spikes=False).pose.cam_from_world for stem in STEMS]
+    assert points is not None
+    assert points.source == "given"
+    assert len(points.xyz) == 20_000
+    assert (points.rgb[:, :2] == [200, 90]).all(), "the mean of what the pictures show"
+    assert np.median(np.linalg.norm(points.xyz, axis=1)) < 0.9
+    judges = 0
+    for pose in poses:  # wherever a picture frames a point, the point lies on its disc, to a pixel's diagonal
+        x, y, z = pose[:, :3] @ points.xyz.T + pose[:, 3:]
+        px, py = f * x / z, f * y / z
+        framed = (z > 0) & (np.abs(px) < W / 2) & (np.abs(py) < H / 2)
+        assert np.hypot(px, py)[framed].max() < f * 0.8 / np.sqrt(16 - 0.64) + 0.71
+        judges = judges + framed
+    assert judges.min() >= 3
+    silhouettes(folder, 0.0)
+    made = build_scene(config(folder, background=0.0), folder / "s.h5", force=True)
+    assert made["points"] == 0
+    assert "no points: nothing lies inside all silhouettes" in made["notes"]
+
+
 def test_lens_distortion_is_refused_with_how_much_it_is(folder: Path) -> None:
     record = json.loads((folder / "t.json").read_text())
     (folder / "t.json").write_text(json.dumps({**record, "k1": 0.1}))
@@ -185,15 +239,14 @@ def test_options_that_make_no_sense(folder: Path) -> None:
     for wrong in (
         {"colmap": folder},
         {"transforms": None},
-        {"test_every": 1},
         {"test_every": -2},
+        {"size": (W, H)},
         {"background": 2.0},
         {"exposure_us": -1.0},
         {"rgb": folder / "nowhere"},
     ):
         with pytest.raises(UsageError):
-            build_scene(BuildConfig(**{"spikes": folder / "spikes", "rgb": folder / "rgb",
-                                       "transforms": folder / "t.json"} | wrong), folder / "s.h5")  # fmt: skip
+            build_scene(config(folder, **wrong), folder / "s.h5")
     with pytest.raises(DataError, match="shorter than the exposure"):
         build_scene(config(folder, exposure_us=2000.0), folder / "s.h5")
     assert not list(folder.glob("s.h5*"))

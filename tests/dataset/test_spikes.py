@@ -174,10 +174,10 @@ def test_m1k40_is_known_without_its_ending(tmp_path, megapixel):
 def test_m1k40_pixels_that_look_like_tags_do_not_start_a_tick(tmp_path, megapixel):
     pixels = np.concatenate([megapixel[0]] * 2)
     first, last = 500, 500 | 3 << 10
-    for row in pixels[0]:  # in the tick before the first whole one: a pair of false tags, a frame apart
+    for row in pixels[0]:  # in the tick before the first whole one: pairs of false tags, as far apart as true ones
         row[4:16] = [first >> k & 1 for k in range(12)]
     for row in pixels[1]:
-        row[4:16] = [last >> k & 1 for k in range(12)]
+        row[504:516] = [last >> k & 1 for k in range(12)]
     path = tmp_path / "a.bin"
     path.write_bytes(m1k40(pixels)[640:])
     with open_spikes(path) as file:

@@ -11,6 +11,7 @@ from spikerig.dataset.errors import NumericsError
 from spikerig.dataset.kernels import count
 from spikerig.dataset.scene import Camera
 from spikerig.rigctl.sim.capture import take_view, view_path
+from spikerig.rigctl.sim.effects import Hooks, Site
 from spikerig.rigctl.sim.effects.shot import ShotNoise, poisson_quantile
 from spikerig.rigctl.sim.light import Stage
 from spikerig.rigctl.sim.orbit import target_depth
@@ -57,6 +58,9 @@ def test_charge_is_conserved(hold: bool) -> None:
     exact = light.astype(np.float64)
     total = sum(n * (exact[k] if hold else (exact[k] + exact[k + 1]) / 2) for k, n in enumerate(steps))
     assert np.array_equal(total, fired + (left / 2.0**32 - start) + clipped)
+    by_tick = integrate(light.copy(), knots, start, [(True, Hooks(light=lambda block: None))])
+    back = counts(by_tick[0], 11) + (by_tick[1] / 2.0**32 - start) + by_tick[2]
+    assert np.array_equal(total, back) if hold else np.allclose(total, back, rtol=1e-6)
     assert (clipped > 0).any()
     assert (clipped == 0).any()
 
@@ -175,8 +179,6 @@ def test_rays_along_axes() -> None:
 def test_shot_noise_is_poisson(mean: float) -> None:
     electrons = 560.0
     light = np.full((200, 40, 50), mean / electrons, np.float32)
-    from spikerig.rigctl.sim.effects import Site
-
     hooks = ShotNoise(electrons).begin(Site(40, 50, 0, 7))
     assert hooks.light is not None
     hooks.light(light)

@@ -6,7 +6,7 @@ from hard_sim import small
 
 from spikerig.dataset.scene import Camera
 from spikerig.rigctl.sim.light import Stage
-from spikerig.rigctl.sim.orbit import orbit_pose
+from spikerig.rigctl.sim.orbit import Orbit, orbit_pose
 from spikerig.rigctl.sim.pattern import Texture, albedo, lattice
 from spikerig.rigctl.sim.shade import irradiance
 from spikerig.rigctl.sim.world import Box, Lamp, Rect, Room, Sphere, World
@@ -88,7 +88,8 @@ def test_supersampling_is_coverage() -> None:
 def test_lamp_and_shadow() -> None:
     """Cosine over squared distance; nothing behind a ball or a box; the box's own lit side is lit."""
     ball, box = Sphere((0, 0, 1), 0.5, Texture()), Box((5, 0, 1), (1, 1, 1), 30.0, Texture())
-    world = World((ball, box), Lamp((0, 0, 3), (1, 1, 1)), (1, 1, 1), 0.0, (0, 0, 0))
+    above = Sphere((0, 0, 4.5), 1.0, Texture())  # beyond the lamp: throws no shadow on the floor
+    world = World((ball, box, above), Lamp((0, 0, 3), (1, 1, 1)), (1, 1, 1), 0.0, (0, 0, 0))
     x = np.array([0, 2, -3, 0.3, 7.3], np.float32)
     p = [x, np.zeros(5, np.float32), np.zeros(5, np.float32)]
     up = [np.float32(0), np.float32(0), np.float32(1)]
@@ -99,6 +100,19 @@ def test_lamp_and_shadow() -> None:
     assert (open_ == 1).all()
     lit, _ = irradiance(world, [np.array([5], np.float32), np.array([0], np.float32), np.array([1.5], np.float32)], up)
     assert lit[0] == pytest.approx(1.5 / np.hypot(5, 1.5) ** 3, rel=1e-5)
+
+
+def test_the_lit_side_of_a_box_is_the_one_to_the_lamp() -> None:
+    """Faces are numbered right: the side seen has its own normal, whichever way the box is turned."""
+    for yaw in (0.0, 30.0):
+        box = Box((0, 0, 0), (1, 1, 1), yaw, Texture(a=(1, 1, 1)))
+        world = World((box,), Lamp((-4, 0, 0), (9, 9, 9)), (0.1, 0.1, 0.1), 0.0, (0, 0, 0))
+        stage, camera = Stage(world), Camera.pinhole(5, 5, 10)
+        lit, dark = (orbit_pose(Orbit(views=1, start_deg=a, radius=3.0, height=0.0), 0) for a in (180, 0))
+        assert stage.picture(camera, lit, 1).min() > 0.3
+        if yaw == 0:
+            assert stage.picture(camera, lit, 1)[2, 2, 0] == pytest.approx(0.1 + 9 / 3.5**2, rel=1e-3)
+        assert np.allclose(stage.picture(camera, dark, 1), 0.1)
 
 
 def test_contact_darkens_and_fades() -> None:
