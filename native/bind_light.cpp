@@ -1,7 +1,9 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/vector.h>
 
+#include <optional>
 #include <stdexcept>
 #include <vector>
 
@@ -42,14 +44,23 @@ std::vector<const float *> starts(const std::vector<Const> &images, size_t count
   return at;
 }
 
-void average(const std::vector<Const> &images, Floats out, Floats light) {
-  need(light.size() == out.size(), "average: out and light have one size");
-  auto at = starts(images, out.size());
+void decode(Const code, Floats light) {
+  need(code.size() == light.size(), "decode: code and light have one size");
   nb::gil_scoped_release release;
-  DISPATCH(average, at.data(), static_cast<int>(at.size()), static_cast<int64_t>(out.size()), out.data(), light.data());
+  DISPATCH(decode, code.data(), static_cast<int64_t>(code.size()), light.data());
 }
 
-void average_back(const std::vector<Const> &images, Const out, Const light, Const grad, const std::vector<Floats> &to) {
+void average(const std::vector<Const> &images, std::optional<Const> base, int n, Floats out, Floats light) {
+  need(light.size() == out.size() && (!base || base->size() == out.size()), "average: base, out and light have one size");
+  need(n >= static_cast<int>(images.size()), "average: n counts the images too");
+  auto at = starts(images, out.size());
+  nb::gil_scoped_release release;
+  DISPATCH(average, at.data(), static_cast<int>(at.size()), base ? base->data() : nullptr, n,
+           static_cast<int64_t>(out.size()), out.data(), light.data());
+}
+
+void average_back(const std::vector<Const> &images, int n, Const out, Const light, Const grad,
+                  const std::vector<Floats> &to) {
   need(light.size() == out.size() && grad.size() == out.size() && to.size() == images.size(),
        "average_back: out, light and grad have one size, one gradient an image");
   auto at = starts(images, out.size());
@@ -59,7 +70,7 @@ void average_back(const std::vector<Const> &images, Const out, Const light, Cons
     into.push_back(g.data());
   }
   nb::gil_scoped_release release;
-  DISPATCH(average_back, at.data(), static_cast<int>(at.size()), static_cast<int64_t>(out.size()), out.data(),
+  DISPATCH(average_back, at.data(), static_cast<int>(at.size()), n, static_cast<int64_t>(out.size()), out.data(),
            light.data(), grad.data(), into.data());
 }
 
@@ -68,6 +79,9 @@ void average_back(const std::vector<Const> &images, Const out, Const light, Cons
 void bind_light(nb::module_ &m) {
   m.def("tfs", &tfs, "image"_a, "texture"_a, "weight"_a, "gray"_a, "domain"_a, "grad"_a,
         "The TfS term and its gradients; train.losses.tfs_loss checks and wraps it.");
-  m.def("average", &average, "images"_a, "out"_a, "light"_a, "Mean in linear light of sRGB-coded images, coded.");
-  m.def("average_back", &average_back, "images"_a, "out"_a, "light"_a, "grad"_a, "to"_a, "Gradient of `average`.");
+  m.def("decode", &decode, "code"_a, "light"_a, "Linear light of sRGB codes.");
+  m.def("average", &average, "images"_a, "base"_a.none(), "n"_a, "out"_a, "light"_a,
+        "Mean in linear light of sRGB-coded images and a sum of others' light, coded.");
+  m.def("average_back", &average_back, "images"_a, "n"_a, "out"_a, "light"_a, "grad"_a, "to"_a,
+        "Gradient of `average`.");
 }

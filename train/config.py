@@ -21,7 +21,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "colour_target": ("frame", "truth"),
     "pose_label": ("mid", "first"),
     "instants_rule": ("midpoints", "endpoints"),
-    "textures": ("both", "tfp", "tfi", "raw"),
+    "textures": ("both", "tfp", "tfi", "tfi-window", "raw"),
     "tfs_combine": ("average", "sum"),
     "tfs_domain": ("encoded", "linear", "luma", "naive"),
     "highlights": ("clip", "keep"),
@@ -48,7 +48,8 @@ class FitConfig:
 
     TfS: `tfs_weight` in the reading `weight_reading` of Eq. TfS (`effective_weight` maps it); textures at
     `textures_per_view` instants, of kind `textures` (`both` = TFP and TFI, averaged to one residual by `tfs_combine`
-    average, or two losses by sum; `raw` = the spike bit itself). `tfs_domain`: encoded = sRGB of texture against sRGB
+    average, or two losses by sum; `tfi-window` = TFI over as many intervals as fit into `texture_window` ticks, the
+    least noisy; `raw` = the spike bit itself). `tfs_domain`: encoded = sRGB of texture against sRGB
     of the gray of the linearised render; linear = both linear; luma = gray of the encoded render against the encoded
     texture; naive = gray of the encoded render against the linear texture (wrong, for the ablation). `highlights`:
     clip textures to display white, where RGB ends too, or keep them.
@@ -102,7 +103,7 @@ class FitConfig:
     textures: str = "both"
     tfs_combine: str = "average"
     tfs_domain: str = "encoded"
-    tfp_window: int = 32
+    texture_window: int = 32
     highlights: str = "clip"
     gray: str = "calibrated"
     # ratio
@@ -123,7 +124,7 @@ class FitConfig:
             raise UsageError("the settings of this fit do not hold together", value="; ".join(faults))
 
     def _range_faults(self) -> list[tuple[bool, str]]:
-        positive = ("steps", "splats", "densify_every", "poses_per_view", "textures_per_view", "tfp_window")
+        positive = ("steps", "splats", "densify_every", "poses_per_view", "textures_per_view", "texture_window")
         rates = [f.name for f in fields(self) if f.name.startswith("lr_")]
         return [
             *((getattr(self, name) < 1, f"{name} must be at least 1") for name in (*positive, "ratio_instants")),
@@ -228,19 +229,22 @@ def spikenerf_5x(config: FitConfig) -> FitConfig:
 
 def spike_ratio(config: FitConfig) -> FitConfig:
     """Ours: the frame times the ratio of texture to exposure mean, at a random instant of 5 a step."""
-    return replace(config, method="spike-ratio", ratio_until=1.0)
+    return replace(config, method="spike-ratio", ratio_until=1.0, textures="tfi-window", texture_window=24)
 
 
 def spike_hybrid(config: FitConfig) -> FitConfig:
-    """Ours, with colour restored: a short start by spike-ratio, then the 5-pose average with TfS, one render a step."""
+    """Ours, with colour restored: a short start by spike-ratio, then the 9-pose average with TfS, one render a step."""
     return replace(
         config,
         method="spike-hybrid",
         ratio_until=0.1,
-        poses_per_view=5,
-        textures_per_view=5,
+        ratio_instants=9,
+        poses_per_view=9,
+        textures_per_view=9,
         fresh_poses=1,
         tfs_weight=40.0,
+        textures="tfi-window",
+        texture_window=24,
     )
 
 

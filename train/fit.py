@@ -24,7 +24,7 @@ from spikerig.train import checkpoint
 from spikerig.train.config import FitConfig, effective_weight
 from spikerig.train.densify import jolt, relocate
 from spikerig.train.gauge import Gauge
-from spikerig.train.losses import average_exposure, l2_loss, mean_weights, tfs_loss
+from spikerig.train.losses import average_exposure, l2_loss, light_of, mean_weights, tfs_loss
 from spikerig.train.model import BACKGROUNDS, Model, splats_of
 from spikerig.train.ssim import l1_ssim
 from spikerig.train.targets import Targets, TrainView
@@ -45,7 +45,7 @@ CHECK_EVERY = 50  # steps between looks for values that are not finite
 class State:
     """What a fit changes: parameters by name, Adam, the next step, seconds trained, held-out dB over time.
 
-    `memory` holds the last renders (float16 codes [H,W,3]) of sub-poses by (view, phase), where fresh_poses asks.
+    `memory`: linear light (float16[H,W,3]) of the last renders of sub-poses by (view, phase), where fresh_poses asks.
     """
 
     params: dict[str, Tensor]
@@ -169,7 +169,7 @@ def view_loss(state: State, task: Task, view: TrainView, fraction: float, rng: n
     def draw(phase: float) -> Tensor:
         image = model.draw(view.instants[phase].pose, background, degree).image
         if config.fresh_poses > 0:
-            state.memory[view.name, phase] = image.detach().half()
+            state.memory[view.name, phase] = light_of(image).half()
         return image
 
     if fraction < config.ratio_until:
@@ -177,13 +177,15 @@ def view_loss(state: State, task: Task, view: TrainView, fraction: float, rng: n
         pictures = {phase: draw(phase)}
         loss = colour_loss(pictures[phase], view.instants[phase].ratio.float(), view.valid, config)
     else:
-        fresh = _fresh(state, task, view, rng)
-        pictures = {phase: draw(phase) for phase in fresh}
-        exposed = average_exposure(
-            [pictures[p] if p in pictures else state.memory[view.name, p].float() for p in targets.colour]
-        )
-        share = len(targets.colour) / max(1, len([p for p in targets.colour if p in pictures]))
-        loss = share * colour_loss(exposed, view.frame, view.valid, config)
+        pictures = {phase: draw(phase) for phase in _fresh(state, task, view, rng)}
+        drawn = [pictures[p] for p in targets.colour if p in pictures]
+        if drawn:
+            kept = [state.memory[view.name, p] for p in targets.colour if p not in pictures]
+            others = sum((light.float() for light in kept[1:]), kept[0].float()) if kept else None
+            exposed = average_exposure(drawn, others, len(targets.colour))
+            loss = len(targets.colour) / len(drawn) * colour_loss(exposed, view.frame, view.valid, config)
+        else:  # only an instant with textures and no part in the average
+            loss = torch.zeros(())
     if task.weight > 0:
         loss = loss + task.weight * _tfs_term(state, task, view, pictures)
     if config.opacity_reg > 0:

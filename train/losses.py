@@ -30,45 +30,63 @@ def srgb_from_linear(light: Tensor) -> Tensor:
     return torch.where(light <= 0.0031308, light * 12.92, curve)
 
 
-def average_oracle(images: list[Tensor]) -> Tensor:
-    """The picture of an exposure: sub-exposures [H,W,3] decoded, averaged in linear light, encoded."""
-    return srgb_from_linear(torch.stack([linear_from_srgb(image) for image in images]).mean(0))
+def average_oracle(images: list[Tensor], others: Tensor | None = None, count: int = 0) -> Tensor:
+    """The definition of `average_exposure`."""
+    light = torch.stack([linear_from_srgb(image) for image in images]).sum(0)
+    return srgb_from_linear((light if others is None else light + others) / max(count, len(images)))
 
 
 class _Average(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, *images: Tensor) -> Tensor:
+    def forward(ctx: Any, others: Tensor | None, count: int, *images: Tensor) -> Tensor:
         out, light = torch.empty_like(images[0]), torch.empty_like(images[0])
-        _native.average([image.numpy() for image in images], out.numpy(), light.numpy())
+        base = None if others is None else others.numpy()
+        _native.average([image.numpy() for image in images], base, count, out.numpy(), light.numpy())
         ctx.save_for_backward(out, light, *images)
+        ctx.count = count
         return out
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
         out, light, *images = ctx.saved_tensors
         to = [torch.empty_like(image) for image in images]
-        _native.average_back(
-            [image.numpy() for image in images],
-            out.numpy(),
-            light.numpy(),
-            grads[0].contiguous().numpy(),
-            [g.numpy() for g in to],
-        )
-        return tuple(to)
+        grad = grads[0].contiguous().numpy()
+        codes = [image.numpy() for image in images]
+        _native.average_back(codes, ctx.count, out.numpy(), light.numpy(), grad, [g.numpy() for g in to])
+        return None, None, *to
 
 
-def average_exposure(images: list[Tensor]) -> Tensor:
-    """The picture of an exposure from sub-exposures [H,W,3] in sRGB codes, averaged in linear light; differentiable.
+def average_exposure(images: list[Tensor], others: Tensor | None = None, count: int = 0) -> Tensor:
+    """The picture of an exposure from sub-exposures, averaged in linear light; differentiable in `images`.
 
-    Edges: one image is returned as it is. Cost: two powers a number. Oracle: `average_oracle`.
+    Args:
+        images: [H,W,3] sRGB codes each, at least one.
+        others: [H,W,3] sum of the linear light of further sub-exposures, or None.
+        count: how many there are in all; 0 means len(images).
+
+    Returns:
+        [H,W,3] sRGB codes.
+
+    Edges: one image alone is returned as it is. Cost: two powers a number of `images`. Oracle: `average_oracle`.
     """
-    if len(images) == 1:
+    count = max(count, len(images))
+    if count == 1:
         return images[0]
     if any(image.shape != images[0].shape for image in images):
         raise UsageError("sub-exposures must have one size", value=[tuple(i.shape) for i in images])
     if images[0].device.type != "cpu" or images[0].dtype != torch.float32:
-        return average_oracle(images)
-    return _Average.apply(*[image.contiguous() for image in images])  # type: ignore[return-value]
+        return average_oracle(images, others, count)
+    return _Average.apply(others, count, *[image.contiguous() for image in images])  # type: ignore[return-value]
+
+
+def light_of(image: Tensor) -> Tensor:
+    """Linear light of sRGB codes, without a gradient; the native kernel where it can."""
+    image = image.detach()
+    if image.device.type != "cpu" or image.dtype != torch.float32:
+        return linear_from_srgb(image)
+    light = torch.empty_like(image)
+    _native.decode(image.contiguous().numpy(), light.numpy())
+    return light
 
 
 def gray_of(image: Tensor, gray: Tensor, domain: str) -> Tensor:

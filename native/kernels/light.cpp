@@ -114,11 +114,19 @@ double tfs(const float *image, const float *texture, const float *weight, const 
   }
 }
 
-void average(const float *const *images, int n, int64_t count, float *out, float *light) {
+void decode(const float *code, int64_t count, float *light) {
+  parallel(static_cast<int>((count + BLOCK - 1) / BLOCK), [&](int part) {
+    int64_t end = std::min(count, (part + 1) * BLOCK);
+    for (int64_t i = part * BLOCK; i < end; ++i) light[i] = linear(code[i]);
+  });
+}
+
+void average(const float *const *images, int fresh, const float *base, int n, int64_t count, float *out,
+             float *light) {
   parallel(static_cast<int>((count + BLOCK - 1) / BLOCK), [&](int part) {
     int64_t begin = part * BLOCK, end = std::min(count, begin + BLOCK);
-    for (int64_t i = begin; i < end; ++i) light[i] = 0.0f;
-    for (int j = 0; j < n; ++j)
+    for (int64_t i = begin; i < end; ++i) light[i] = base ? base[i] : 0.0f;
+    for (int j = 0; j < fresh; ++j)
       for (int64_t i = begin; i < end; ++i) light[i] += linear(images[j][i]);
     float share = 1.0f / static_cast<float>(n);
     for (int64_t i = begin; i < end; ++i) {
@@ -128,12 +136,12 @@ void average(const float *const *images, int n, int64_t count, float *out, float
   });
 }
 
-void average_back(const float *const *images, int n, int64_t count, const float *out, const float *light,
+void average_back(const float *const *images, int fresh, int n, int64_t count, const float *out, const float *light,
                   const float *grad, float *const *grad_images) {
   float share = 1.0f / static_cast<float>(n);
   parallel(static_cast<int>((count + BLOCK - 1) / BLOCK), [&](int part) {
     int64_t begin = part * BLOCK, end = std::min(count, begin + BLOCK);
-    for (int j = 0; j < n; ++j) {
+    for (int j = 0; j < fresh; ++j) {
       const float *image = images[j];
       float *to = grad_images[j];
       for (int64_t i = begin; i < end; ++i)

@@ -11,6 +11,7 @@ from spikerig.train.losses import (
     average_exposure,
     average_oracle,
     l2_loss,
+    light_of,
     linear_from_srgb,
     mean_weights,
     ratio_target,
@@ -78,6 +79,23 @@ def test_average_matches_its_definition(isa):
     assert relative(got.detach(), exact.detach()) < 5e-7
     for g, e in zip(got_in, exact_in, strict=True):
         assert relative(g.grad, e.grad) < 3e-6
+
+
+def test_average_with_remembered_light_is_the_average_of_all(isa):
+    images = [picture(seed) for seed in range(4)]
+    everything = average_exposure(images)
+    first = images[0].clone().requires_grad_()
+    others = sum(light_of(i) for i in images[1:])
+    some = average_exposure([first], others, 4)
+    assert relative(some.detach(), everything) < 5e-7
+    some.sum().backward()
+    leaf = images[0].clone().requires_grad_()
+    average_exposure([leaf, *images[1:]]).sum().backward()
+    assert relative(first.grad, leaf.grad) < 1e-5
+
+
+def test_light_of_is_the_curve(isa):
+    assert relative(light_of(picture(1)), linear_from_srgb(picture(1).double())) < 1e-6
 
 
 def test_same_bits_for_any_thread_count():
