@@ -59,8 +59,8 @@ def steps(out: Path, seconds: dict[str, float], seed: int) -> list[Step]:
 
 def demo(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the run.")] = Path("runs/demo"),
-    seconds: Annotated[float, typer.Option(help="Training seconds of each method on the main scene.")] = 24.0,
-    chroma_seconds: Annotated[float, typer.Option(help="The same on the chroma scene; 0 leaves it out.")] = 14.0,
+    seconds: Annotated[float, typer.Option(help="Training seconds of each method on the main scene.")] = 20.0,
+    chroma_seconds: Annotated[float, typer.Option(help="The same on the chroma scene; 0 leaves it out.")] = 10.0,
     seed: Annotated[int, typer.Option(help="Seed of the simulation and of training.")] = 0,
     force: Annotated[bool, typer.Option("--force", help="Start over; without it an interrupted demo goes on.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,

@@ -1,0 +1,40 @@
+"""`spikerig cost kernels`: one document with every kernel in it."""
+
+import json
+
+import pytest
+
+from spikerig.dataset import bench as spike_bench
+from spikerig.dataset.cli import run
+from spikerig.train import bench as train_bench
+
+
+def row(kernel: str) -> dict:
+    return {
+        "kernel": kernel, "seconds": 0.04, "oracle_seconds": 4.0, "ratio": 100.0, "size": "400x250", "isa": "plain",
+        "threads": 1,
+    }  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    spikes = [row(k) for k in ("unpack", "count", "tfi_at", "tfi_all", "fire")]
+    splats = [row("raster") | {"consulted_per_pixel": 320.0, "splat_pixels_per_second": 7e8}, row("ssim")]
+    monkeypatch.setattr(spike_bench, "rows", lambda quick: spikes)
+    monkeypatch.setattr(train_bench, "rows", lambda quick: splats)
+
+
+def test_json_lists_every_kernel(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["cost", "kernels", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["schema"] == "spikerig.cost.kernels/1"
+    names = [r["kernel"] for r in document["kernels"]]
+    assert names == ["unpack", "count", "tfi_at", "tfi_all", "fire", "raster", "ssim"]
+    assert document["machine"]["isa"] in ("plain", "avx2", "avx512")
+
+
+def test_table_tells_how_many_splats_a_pixel_consults(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["cost", "kernels"]) == 0
+    out = capsys.readouterr().out
+    assert "raster      40.000" in out
+    assert "320 splats consulted a pixel, 700 M splat-pixels/s" in out
