@@ -28,11 +28,13 @@ def plan(steps: int) -> Iterator[tuple[str, Any, Any]]:
     """Every run of the sweep: (series, knob value, config)."""
     from spikerig.train.config import configure
 
-    for method in ("plain", "spikenerf", "spike-ratio", "oracle"):
+    for method in ("plain", "average", "spikenerf", "spike-ratio", "spike-hybrid", "oracle"):
         for n in STEPS:
             yield f"{method}: steps", n, configure(method, "draft", steps=n)
     for n in COUNTS:
-        yield f"average: poses_per_view, {steps} steps", n, configure("average", "draft", steps=steps, poses_per_view=n)
+        every = configure("average", "draft", steps=steps, poses_per_view=n, fresh_poses=0)
+        yield f"average: poses_per_view, all rendered, {steps} steps", n, every
+        yield f"average: poses_per_view, one rendered, {steps} steps", n, replace(every, fresh_poses=1)
     five = configure("spikenerf-5x", "draft", steps=steps)
     for n in COUNTS[:-1]:
         both = replace(five, poses_per_view=n, textures_per_view=n)

@@ -60,7 +60,7 @@ def run_fit(
     begin = time.monotonic()
     with open_scene(path) as scene, one_torch_thread():
         records.prepare_folder(out, force=force, resume=resume)
-        task, record = _prepare(scene, path, config)
+        task, record = prepare(scene, path, config)
         state = _start(out, scene, task, resume)
         exams = _exams(scene)
     record["prepare_seconds"] = time.monotonic() - begin
@@ -78,7 +78,8 @@ def run_fit(
     return _finish(state, watch, record, ply)
 
 
-def _prepare(scene: SceneFile, path: Path, config: FitConfig) -> tuple[Task, dict[str, Any]]:
+def prepare(scene: SceneFile, path: Path, config: FitConfig) -> tuple[Task, dict[str, Any]]:
+    """All that a fit of an open scene (from `path`) needs, and the record of it for run.json."""
     check_pinhole(scene.camera)
     poses = np.stack([scene.view(name, spikes=False).pose.cam_from_world for name in scene.names] or [np.eye(4)[:3]])
     points = scene.points

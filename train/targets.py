@@ -102,7 +102,7 @@ def spike_tick(view: View, at_ns: float, clock: ClockModel | None) -> float:
 
 
 def windowed_tfi(stream: SpikeStream, tick: float, window: int) -> Texture:
-    """TFI over the most intervals (1, 3, 5, 9, 15: as many before as after) that fit into a window of ticks.
+    """TFI over the most intervals (1, 3 or 9: as many before as after) that fit into a window of ticks.
 
     One interval where even three are longer. Bright pixels get the low noise of a window, dark ones no zero counts:
     on the demo scene its error is half that of TFP over 32 ticks.
@@ -111,7 +111,7 @@ def windowed_tfi(stream: SpikeStream, tick: float, window: int) -> Texture:
 
     first = tfi(stream, tick)
     light, known = first.light.copy(), first.known
-    for k in (3, 5, 9, 15):
+    for k in (3, 9):
         longer = tfi(stream, tick, intervals=k)
         fits = longer.known & (k <= window * longer.light)
         light[fits] = longer.light[fits]

@@ -1,0 +1,61 @@
+"""The flat config: presets, methods, settings by name, and the readings of w."""
+
+from dataclasses import replace
+
+import pytest
+
+from spikerig.dataset.errors import UsageError
+from spikerig.train.config import (
+    METHODS,
+    PRESETS,
+    FitConfig,
+    configure,
+    effective_weight,
+    from_json,
+    parse_setting,
+)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_method_goes_with_every_preset_and_survives_json(method, preset):
+    config = configure(method, preset, steps=7)
+    assert (config.method, config.preset, config.steps) == (method, preset, 7)
+    assert from_json(config.as_json()) == config
+
+
+def test_all_faults_are_told_at_once():
+    with pytest.raises(UsageError) as caught:
+        FitConfig(gray="green", steps=0, lr_end=2.0, ratio_min=2.0)
+    for part in ("gray is 'green'", "steps must", "lr_end must", "ratio_min"):
+        assert part in str(caught.value)
+
+
+def test_settings_by_name():
+    assert parse_setting("antialias=true") == ("antialias", True)
+    assert parse_setting("lr_means=1e-3") == ("lr_means", 1e-3)
+    assert parse_setting("textures=tfp") == ("textures", "tfp")
+    for wrong in ("lr_means", "nothing=1", "steps=many", "antialias=perhaps"):
+        with pytest.raises(UsageError):
+            parse_setting(wrong)
+    with pytest.raises(UsageError) as caught:
+        from_json({"steps": 3, "warp": 9})
+    assert caught.value.value == "warp"
+
+
+def test_the_readings_of_w_differ_by_what_the_equation_leaves_open():
+    pixels = 400 * 250
+    assert effective_weight(1e-4, "mean", pixels) == 1e-4
+    assert effective_weight(1e-4, "sum-batch", pixels) == pytest.approx(0.1024)
+    assert effective_weight(1e-4, "sum-image", pixels) == pytest.approx(10)
+    assert effective_weight(1e-4, "u8", pixels) == pytest.approx(6.5, abs=0.01)
+
+
+def test_what_a_method_needs():
+    needs = {m: (configure(m).needs_spikes, configure(m).needs_trajectory) for m in METHODS}
+    assert needs["plain"] == (False, False)
+    assert needs["average"] == (False, True)
+    assert needs["spikenerf"] == (True, False)
+    assert needs["spike-ratio"] == (True, True)
+    assert needs["oracle"] == (False, False)
+    assert replace(configure("plain"), pose_label="first").needs_trajectory
