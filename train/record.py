@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from spikerig.dataset import machine
 from spikerig.dataset.errors import DataError, HostError, UsageError
 from spikerig.dataset.scene import Camera
@@ -115,7 +117,7 @@ def open_run(folder: Path) -> Run:
     tensors, _ = checkpoint.load(folder / CHECKPOINT)
     try:
         config = from_json(record["config"])
-        camera = Camera(record["camera"]["K"], [], record["camera"]["width"], record["camera"]["height"])
+        camera = Camera(record["camera"]["K"], np.zeros(0), record["camera"]["width"], record["camera"]["height"])
         centre = record["gauge"]["centre"]
         gauge = Gauge((float(centre[0]), float(centre[1]), float(centre[2])), float(record["gauge"]["scale"]))
         splats = splats_of({k.removeprefix("param/"): v for k, v in tensors.items() if k.startswith("param/")})

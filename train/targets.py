@@ -136,7 +136,7 @@ def average_texture(found: list[Texture]) -> tuple[NDArray[np.float32], NDArray[
     """Mean over the textures known at each pixel: (light [H,W], known where any is)."""
     known = np.stack([t.known for t in found])
     light = np.where(known, np.stack([t.light for t in found]), 0).sum(0)
-    return (light / np.maximum(known.sum(0), 1)).astype(np.float32), known.any(0)
+    return (light / np.maximum(known.sum(0), 1)).astype(np.float32), np.asarray(known.any(0), np.bool_)
 
 
 def exposure_mean(view: View, clock: ClockModel | None) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
@@ -154,7 +154,7 @@ def exposure_mean(view: View, clock: ClockModel | None) -> tuple[NDArray[np.floa
         )
     lost = any(a < t1 and b > t0 for a, b in stream.lost)
     light = np.asarray(window_sum(stream, t0, t1), np.float32) / (t1 - t0)
-    return light, np.full(light.shape, not lost)
+    return np.asarray(light, np.float32), np.full(light.shape, not lost)
 
 
 def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
