@@ -52,7 +52,7 @@ def steps(out: Path, seconds: dict[str, float], seed: int) -> list[Step]:
             fit = ("train", "fit", file, "--field", "splat", "--method", method, "--preset", "draft")
             fit += ("--seconds", f"{budget:g}", "--seed", str(seed), "-o", run, "--force", "--json")
             listed.append(Step(f"{scene}-{method}-fit", fit, f"train '{method}' on '{scene}' for {budget:g} s"))
-            score = ("train", "score", run, "--pictures", str(Path(run) / "pictures"), "--json")
+            score = ("train", "score", run, "--pictures", str(Path(run) / "pictures"), "--force", "--json")
             listed.append(Step(f"{scene}-{method}-score", score, f"score '{method}' on sharp held-out views"))
     return listed
 

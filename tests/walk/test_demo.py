@@ -16,6 +16,7 @@ def test_every_line_of_the_plan_is_a_command_that_exists() -> None:
     for step in plan:
         assert ".".join(step.words[:2]) in known, step.words
     assert len({step.key for step in plan}) == len(plan)
+    assert all("--force" in step.words for step in plan), "a step cut short by an interrupt must be able to run again"
     budgets = [step.words[step.words.index("--seconds") + 1] for step in plan if step.key.endswith("-fit")]
     assert budgets == ["24"] * 5 + ["14"] * 5, "equal seconds within a scene"
 
