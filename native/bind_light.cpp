@@ -3,10 +3,12 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/vector.h>
 
+#include <cmath>
 #include <optional>
 #include <stdexcept>
 #include <vector>
 
+#include "adam.hpp"
 #include "light.hpp"
 
 namespace nb = nanobind;
@@ -74,6 +76,23 @@ void average_back(const std::vector<Const> &images, int n, Const out, Const ligh
            light.data(), grad.data(), into.data());
 }
 
+void adam(Floats param, Const grad, Floats mean, Floats square, int64_t columns, int64_t head, int64_t count,
+          double rate_head, double rate_rest, double beta1, double beta2, double eps) {
+  auto size = static_cast<int64_t>(param.size());
+  need(grad.size() == param.size() && mean.size() == param.size() && square.size() == param.size(),
+       "adam: param, grad, mean and square have one size");
+  need(columns >= 1 && size % columns == 0 && head >= 0 && count >= 1, "adam: size = rows x columns, count from 1");
+  double warm = 1.0 - std::pow(beta1, static_cast<double>(count));
+  spikerig::AdamStep step{static_cast<float>(beta1),
+                          static_cast<float>(beta2),
+                          static_cast<float>(eps),
+                          static_cast<float>(rate_head / warm),
+                          static_cast<float>(rate_rest / warm),
+                          static_cast<float>(1.0 / std::sqrt(1.0 - std::pow(beta2, static_cast<double>(count))))};
+  nb::gil_scoped_release release;
+  DISPATCH(adam, param.data(), grad.data(), mean.data(), square.data(), size / columns, columns, head, step);
+}
+
 }  // namespace
 
 void bind_light(nb::module_ &m) {
@@ -84,4 +103,6 @@ void bind_light(nb::module_ &m) {
         "Mean in linear light of sRGB-coded images and a sum of others' light, coded.");
   m.def("average_back", &average_back, "images"_a, "n"_a, "out"_a, "light"_a, "grad"_a, "to"_a,
         "Gradient of `average`.");
+  m.def("adam", &adam, "param"_a, "grad"_a, "mean"_a, "square"_a, "columns"_a, "head"_a, "count"_a, "rate_head"_a,
+        "rate_rest"_a, "beta1"_a, "beta2"_a, "eps"_a, "One step of Adam, in place; train.adam.update wraps it.");
 }

@@ -21,6 +21,7 @@ from torch import Tensor
 from spikerig.dataset.errors import NumericsError
 from spikerig.dataset.scene import Camera
 from spikerig.train import checkpoint
+from spikerig.train.adam import update
 from spikerig.train.config import FitConfig, effective_weight
 from spikerig.train.densify import jolt, relocate
 from spikerig.train.gauge import Gauge
@@ -43,13 +44,13 @@ CHECK_EVERY = 50  # steps between looks for values that are not finite
 
 @dataclass(slots=True, eq=False)
 class State:
-    """What a fit changes: parameters by name, Adam, the next step, seconds trained, held-out dB over time.
+    """What a fit changes: parameters and Adam's moments by name, the next step, seconds trained, held-out dB over time.
 
     `memory`: linear light (float16[H,W,3]) of the last renders of sub-poses by (view, phase), where fresh_poses asks.
     """
 
     params: dict[str, Tensor]
-    optimiser: torch.optim.Adam
+    moments: dict[str, tuple[Tensor, Tensor]]
     step: int = 0
     seconds: float = 0.0
     history: list[dict[str, Any]] = field(default_factory=list)
@@ -82,11 +83,7 @@ def new_state(params: dict[str, Tensor], task: Task) -> State:
     if task.config.gray == "learned" and task.targets.gray is not None:
         params = {**params, "gray": task.gray}
     leaves = {name: p.detach().clone().requires_grad_() for name, p in params.items()}
-    return State(leaves, _adam(leaves))
-
-
-def _adam(leaves: dict[str, Tensor]) -> torch.optim.Adam:
-    return torch.optim.Adam([{"params": [p], "name": n, "lr": 0.0} for n, p in leaves.items()], eps=1e-15, fused=True)
+    return State(leaves, {name: (torch.zeros_like(p), torch.zeros_like(p)) for name, p in params.items()})
 
 
 @contextmanager
@@ -140,14 +137,14 @@ def one_step(state: State, task: Task, fraction: float) -> float:
     count = len(task.targets.views)
     order = np.random.default_rng((config.seed, 3, state.step // count)).permutation(count)
     view = task.targets.views[order[state.step % count]]
-    _set_rates(state, config, fraction)
-    state.optimiser.zero_grad(set_to_none=True)
+    for p in state.params.values():
+        p.grad = None
     loss = view_loss(state, task, view, fraction, rng)
     value = loss.item()
     if not np.isfinite(value):
         raise _not_finite(state, f"the loss of view '{view.name}' is {value}")
     loss.backward()
-    state.optimiser.step()
+    _descend(state, config, fraction)
     if state.step % CHECK_EVERY == 0:
         check_finite(state)
     if config.densify == "mcmc":
@@ -208,12 +205,11 @@ def _fresh(state: State, task: Task, view: TrainView, rng: np.random.Generator) 
 def _tfs_term(state: State, task: Task, view: TrainView, pictures: dict[float, Tensor]) -> Tensor:
     gray = state.params.get("gray", task.gray)
     supervised = [phase for phase in pictures if view.instants[phase].textures]
-    terms = [
-        tfs_loss(pictures[phase], texture, weight, gray, task.config.tfs_domain)
-        for phase in supervised
-        for texture, weight in view.instants[phase].textures
-    ]
-    return torch.stack(terms).sum() / len(supervised) if terms else torch.zeros(())
+    total = torch.zeros(())
+    for phase in supervised:
+        for texture, weight in view.instants[phase].textures:
+            total = total + tfs_loss(pictures[phase], texture, weight, gray, task.config.tfs_domain)
+    return total / len(supervised) if len(supervised) > 1 else total
 
 
 def colour_loss(image: Tensor, target: Tensor, valid: Tensor | None, config: FitConfig) -> Tensor:
@@ -223,39 +219,23 @@ def colour_loss(image: Tensor, target: Tensor, valid: Tensor | None, config: Fit
     return l1_ssim(image, target, ssim_weight=config.ssim_weight, valid=valid)
 
 
-def _set_rates(state: State, config: FitConfig, fraction: float) -> None:
+def _descend(state: State, config: FitConfig, fraction: float) -> None:
     decay = config.lr_end ** min(fraction, 1.0)
-    for group in state.optimiser.param_groups:
-        group["lr"] = getattr(config, RATES[group["name"]]) * decay
+    for name, p in state.params.items():
+        rate = getattr(config, RATES[name]) * decay
+        rest = rate * HIGHER_SH if name == "sh" else None
+        update(p, state.moments[name], state.step + 1, rate, head=3, rest=rest)
 
 
 def _mcmc(state: State, config: FitConfig, fraction: float, rng: np.random.Generator) -> None:
     splats = {n: p for n, p in state.params.items() if n != "gray"}
     if state.step > 0 and state.step % config.densify_every == 0 and fraction < config.densify_until:
-        moments = {n: (_moment(state, p, "exp_avg"), _moment(state, p, "exp_avg_sq")) for n, p in splats.items()}
         with torch.no_grad():
-            moved, moved_moments = relocate(splats, moments, config.splats, rng)
-        _replace(state, moved, moved_moments)
-        splats = {n: p for n, p in state.params.items() if n != "gray"}
+            splats, moments = relocate(splats, {n: state.moments[n] for n in splats}, config.splats, rng)
+        state.params |= {n: p.detach().requires_grad_() for n, p in splats.items()}
+        state.moments |= moments
+        splats = {n: state.params[n] for n in splats}
     jolt(splats, config.noise * config.lr_means * config.lr_end**fraction, rng)
-
-
-def _moment(state: State, p: Tensor, name: str) -> Tensor:
-    return state.optimiser.state[p][name]
-
-
-def _replace(state: State, params: dict[str, Tensor], moments: dict[str, tuple[Tensor, Tensor]]) -> None:
-    """Swap tensors (of another length, perhaps) into the optimiser, keeping its step counts."""
-    for group in state.optimiser.param_groups:
-        name = group["name"]
-        if name not in params:
-            continue
-        old = group["params"][0]
-        new = params[name].detach().clone().requires_grad_()
-        kept = state.optimiser.state.pop(old)
-        state.optimiser.state[new] = {**kept, "exp_avg": moments[name][0], "exp_avg_sq": moments[name][1]}
-        group["params"] = [new]
-        state.params[name] = new
 
 
 def check_finite(state: State) -> None:
@@ -285,9 +265,8 @@ def _not_finite(state: State, what: str) -> NumericsError:
 def save_state(path: Path, state: State, config: FitConfig) -> None:
     """Checkpoint: everything that the rest of the run depends on."""
     tensors: dict[str, Tensor] = {f"param/{n}": p for n, p in state.params.items()}
-    for name, p in state.params.items():
-        for key, value in state.optimiser.state.get(p, {}).items():
-            tensors[f"adam/{name}/{key}"] = value
+    for name, (mean, square) in state.moments.items():
+        tensors |= {f"adam/{name}/mean": mean, f"adam/{name}/square": square}
     tensors |= {f"memory/{view}/{phase!r}": image for (view, phase), image in state.memory.items()}
     record = {"step": state.step, "seconds": state.seconds, "history": state.history, "config": config.as_json()}
     checkpoint.save(path, tensors, record)
@@ -297,11 +276,8 @@ def load_state(path: Path) -> tuple[State, dict[str, Any]]:
     """The state of a checkpoint, and the config it was made with."""
     tensors, record = checkpoint.load(path)
     leaves = {n.removeprefix("param/"): p.requires_grad_() for n, p in tensors.items() if n.startswith("param/")}
-    state = State(leaves, _adam(leaves), int(record["step"]), float(record["seconds"]), list(record["history"]))
-    for name, p in leaves.items():
-        found = {k.split("/")[2]: v for k, v in tensors.items() if k.startswith(f"adam/{name}/")}
-        if found:
-            state.optimiser.state[p] = found
+    moments = {name: (tensors[f"adam/{name}/mean"], tensors[f"adam/{name}/square"]) for name in leaves}
+    state = State(leaves, moments, int(record["step"]), float(record["seconds"]), list(record["history"]))
     for name, image in tensors.items():
         if name.startswith("memory/"):
             _, view, phase = name.split("/")

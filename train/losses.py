@@ -106,16 +106,15 @@ class _Tfs(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, texture: Tensor, weight: Tensor, gray: Tensor, domain: str) -> Tensor:
         grad = torch.empty_like(image)
-        value, by_gray = _native.tfs(
-            image.numpy(), texture.numpy(), weight.numpy(), gray.numpy(), DOMAINS[domain], grad.numpy()
-        )
-        ctx.save_for_backward(grad, torch.tensor(by_gray, dtype=gray.dtype))
+        arrays = (image.numpy(), texture.numpy(), weight.numpy(), gray.numpy())
+        value, by_gray = _native.tfs(*arrays, DOMAINS[domain], grad.numpy())
+        ctx.grad, ctx.by_gray = grad, by_gray
         return torch.tensor(value, dtype=image.dtype)
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
-        grad, by_gray = ctx.saved_tensors
-        return grads[0] * grad, None, None, grads[0] * by_gray if ctx.needs_input_grad[3] else None, None
+        by_gray = grads[0] * torch.tensor(ctx.by_gray) if ctx.needs_input_grad[3] else None
+        return ctx.grad * grads[0], None, None, by_gray, None
 
 
 def tfs_loss(image: Tensor, texture: Tensor, weight: Tensor, gray: Tensor, domain: str = "encoded") -> Tensor:

@@ -15,20 +15,17 @@ from spikerig.dataset import machine
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.terminal import Progress, emit, note
 
-WARM = 30  # steps before the clock runs
 
-
-def step_cost(scene: Path, *, splats: int, steps: int, rounds: int) -> list[dict[str, Any]]:
-    """CPU and wall seconds of a step for plain, spikenerf with w = 0, spikenerf 1x, and our methods.
+def step_cost(scene: Path, *, splats: int, steps: int) -> list[dict[str, Any]]:
+    """CPU and wall seconds of a step for spikenerf with w = 0 and 1x, plain, and our methods.
 
     Args:
         scene: a scene file.
-        splats: as many in every row.
-        steps: timed steps of each row in a round.
-        rounds: rounds over all rows in turn, so that the machine's mood is shared; medians of steps are reported.
+        splats: of the one model that all rows train in turn, a step each, so that every row draws the same splats.
+        steps: timed steps of each row; medians are reported.
 
     Returns:
-        Rows: row, cpu_seconds, wall_seconds, over_w0 (CPU against spikenerf with w = 0 of the same run), splats, size.
+        Rows: row, cpu_seconds, wall_seconds, over_w0 (CPU against spikenerf with w = 0), splats, size.
     """
     from spikerig.dataset.store import open_scene
     from spikerig.train.config import configure
@@ -36,32 +33,31 @@ def step_cost(scene: Path, *, splats: int, steps: int, rounds: int) -> list[dict
     from spikerig.train.run import prepare
     from spikerig.train.start import start_splats
 
-    one = configure("spikenerf", "draft", splats=splats, steps=10**9)
+    one = configure("spikenerf", "draft", splats=splats)
     configs = {
         "spikenerf, w = 0": replace(one, tfs_weight=0.0),
         "spikenerf 1x": one,
-        "plain": configure("plain", "draft", splats=splats, steps=10**9),
-        "spike-ratio": configure("spike-ratio", "draft", splats=splats, steps=10**9),
-        "spike-hybrid": configure("spike-hybrid", "draft", splats=splats, steps=10**9, ratio_until=0.0),
+        "plain": configure("plain", "draft", splats=splats),
+        "spike-ratio": configure("spike-ratio", "draft", splats=splats),
+        "spike-hybrid": configure("spike-hybrid", "draft", splats=splats, ratio_until=0.0),
     }
-    found: dict[str, list[tuple[float, float]]] = {name: [] for name in configs}
-    runs = {}
     with open_scene(scene) as file:
-        for name, config in configs.items():
-            task, _ = prepare(file, scene, config)
-            runs[name] = task, new_state(start_splats(file.points, task.gauge, config), task)
-    bar = Progress("cost step", rounds * len(configs), "rows")
+        tasks = {name: prepare(file, scene, config)[0] for name, config in configs.items()}
+        first = tasks["spikenerf 1x"]
+        state = new_state(start_splats(file.points, first.gauge, one), first)
+    found: dict[str, list[tuple[float, float]]] = {name: [] for name in tasks}
+    warm = 2 * len(first.targets.views)  # every view's sub-poses are remembered by then
+    bar = Progress("cost step", warm + steps, "rounds")
     gc.disable()
     try:
         with one_torch_thread():
-            for turn in range(rounds):
-                for name, (task, state) in runs.items():
-                    for number in range(steps + (WARM if turn == 0 else 3)):
-                        cpu, wall = time.process_time(), time.perf_counter()
-                        one_step(state, task, 0.5)
-                        if number >= (WARM if turn == 0 else 3):
-                            found[name].append((time.process_time() - cpu, time.perf_counter() - wall))
-                    bar.step()
+            for number in range(warm + steps):
+                for name, task in tasks.items():
+                    cpu, wall = time.process_time(), time.perf_counter()
+                    one_step(state, task, 0.5)
+                    if number >= warm:
+                        found[name].append((time.process_time() - cpu, time.perf_counter() - wall))
+                bar.step()
     finally:
         gc.enable()
     base = median(cpu for cpu, _ in found["spikenerf, w = 0"])
@@ -72,7 +68,7 @@ def step_cost(scene: Path, *, splats: int, steps: int, rounds: int) -> list[dict
             "wall_seconds": median(wall for _, wall in times),
             "over_w0": median(cpu for cpu, _ in times) / base - 1,
             "splats": splats,
-            "size": f"{runs[name][0].camera.width}x{runs[name][0].camera.height}",
+            "size": f"{first.camera.width}x{first.camera.height}",
         }
         for name, times in found.items()
     ]
@@ -81,14 +77,13 @@ def step_cost(scene: Path, *, splats: int, steps: int, rounds: int) -> list[dict
 def step(
     scene: Annotated[Path, typer.Argument(help="A scene file (.h5) with spikes and trajectories.")],
     splats: Annotated[int, typer.Option(help="In every row.")] = 12_000,
-    steps: Annotated[int, typer.Option(help="Timed steps of a row in each round.")] = 40,
-    rounds: Annotated[int, typer.Option(help="Rounds over all rows in turn.")] = 7,
+    steps: Annotated[int, typer.Option(help="Timed steps of each row.")] = 300,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
 ) -> None:
     """Cost of one training step: TfS 1x beside the same run with w = 0, and our methods."""
-    if min(splats, steps, rounds) < 1:
-        raise UsageError("splats, steps and rounds must be at least 1", value=(splats, steps, rounds))
-    rows, where = step_cost(scene, splats=splats, steps=steps, rounds=rounds), machine.describe()
+    if min(splats, steps) < 1:
+        raise UsageError("splats and steps must be at least 1", value=(splats, steps))
+    rows, where = step_cost(scene, splats=splats, steps=steps), machine.describe()
     if as_json:
         emit("spikerig.cost.step/1", {"rows": rows, "machine": where, "command": machine.command()})
         return

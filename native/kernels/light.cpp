@@ -51,35 +51,49 @@ inline float coded_slope(float light, float code) {
   return light <= 0.0031308f ? 12.92f : (code + 0.055f) / (2.4f * larger(light, 0.0031308f));
 }
 
+// Sums by lane: floats within a chunk, doubles over chunks; the order is the same for any thread count.
+constexpr int LANES = 16;
+static_assert(CHUNK % LANES == 0);
+
 struct Sums {
   double value = 0, gray[4] = {0, 0, 0, 0};
 };
 
+inline double lane_sum(const float *x) {
+  float lane[LANES] = {};
+  for (int p = 0; p < CHUNK; p += LANES)
+    for (int l = 0; l < LANES; ++l) lane[l] += x[p + l];
+  double sum = 0;
+  for (int l = 0; l < LANES; ++l) sum += lane[l];
+  return sum;
+}
+
 template <Domain domain>
 void tfs_chunk(const float *image, const float *texture, const float *weight, const float *gray, int n,
                float *grad_image, Sums &sums) {
-  float channel[3][CHUNK], slope[3][CHUNK], pull[CHUNK], loss[CHUNK];
-  for (int c = 0; c < 3; ++c)
-    for (int p = 0; p < n; ++p) {
-      float code = image[3 * p + c];
-      float light = domain == Domain::code ? code : linear(code);
-      channel[c][p] = light;
-      slope[c][p] = domain == Domain::code ? 1.0f : linear_slope(code, light);
-    }
+  float light[3 * CHUNK], slope[3 * CHUNK], spread[3 * CHUNK], pull[CHUNK] = {}, loss[CHUNK] = {};
+  for (int i = 0; i < 3 * n; ++i) {
+    float code = image[i];
+    light[i] = domain == Domain::code ? code : linear(code);
+    slope[i] = domain == Domain::code ? 1.0f : linear_slope(code, light[i]);
+  }
   for (int p = 0; p < n; ++p) {
-    float y = gray[0] * channel[0][p] + gray[1] * channel[1][p] + gray[2] * channel[2][p] + gray[3];
+    float y = gray[0] * light[3 * p] + gray[1] * light[3 * p + 1] + gray[2] * light[3 * p + 2] + gray[3];
     float z = domain == Domain::encoded ? coded(y) : y;
     float r = z - texture[p];
     float wr = weight[p] > 0.0f ? weight[p] * r : 0.0f;  // a masked texture may hold anything
     loss[p] = weight[p] > 0.0f ? wr * r : 0.0f;
     pull[p] = 2.0f * wr * (domain == Domain::encoded ? coded_slope(y, z) : 1.0f);
   }
-  for (int c = 0; c < 3; ++c)
-    for (int p = 0; p < n; ++p) grad_image[3 * p + c] = pull[p] * gray[c] * slope[c][p];
-  for (int p = 0; p < n; ++p) {
-    sums.value += loss[p];
-    for (int c = 0; c < 3; ++c) sums.gray[c] += static_cast<double>(pull[p]) * channel[c][p];
-    sums.gray[3] += pull[p];
+  for (int p = 0; p < n; ++p)
+    for (int c = 0; c < 3; ++c) spread[3 * p + c] = pull[p] * gray[c];
+  for (int i = 0; i < 3 * n; ++i) grad_image[i] = spread[i] * slope[i];
+  sums.value += lane_sum(loss);
+  sums.gray[3] += lane_sum(pull);
+  for (int c = 0; c < 3; ++c) {
+    float product[CHUNK] = {};
+    for (int p = 0; p < n; ++p) product[p] = pull[p] * light[3 * p + c];
+    sums.gray[c] += lane_sum(product);
   }
 }
 
