@@ -35,10 +35,12 @@ def update(
     if not fits or count < 1:
         raise UsageError("Adam needs float32 tensors of one shape and steps from 1", value=(tuple(param.shape), count))
     columns = max(1, param[0].numel()) if param.ndim > 1 and len(param) else 1
+    first, second = (m.numpy() for m in moments)
     _native.adam(
         param.detach().numpy(),
         param.grad.contiguous().numpy(),
-        *(m.numpy() for m in moments),
+        first,
+        second,
         columns,
         columns if rest is None else min(head, columns),
         count,
