@@ -109,6 +109,7 @@ def test_dark_current_is_charge_without_light() -> None:
     assert (count(seen.spikes.bits, 5, 0, 1000) == 10).all() or (count(seen.spikes.bits, 5, 0, 1000) == 9).all()
     spread = run(DarkCurrent(0.01, 0.004), light=steady(0.0, 20_000, 20, 20))
     rates = count(spread.spikes.bits, 20, 0, 20_000) / 20_000
+    assert rates.mean() == pytest.approx(0.01, rel=0.05)
     assert rates.std() == pytest.approx(0.004, rel=0.15)
 
 
