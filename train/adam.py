@@ -35,18 +35,17 @@ def update(
     if not fits or count < 1:
         raise UsageError("Adam needs float32 tensors of one shape and steps from 1", value=(tuple(param.shape), count))
     columns = max(1, param[0].numel()) if param.ndim > 1 and len(param) else 1
-    first, second = (m.numpy() for m in moments)
     _native.adam(
-        param.detach().numpy(),
-        param.grad.contiguous().numpy(),
-        first,
-        second,
-        columns,
-        columns if rest is None else min(head, columns),
-        count,
-        rate,
-        rate if rest is None else rest,
-        BETA1,
-        BETA2,
-        EPS,
+        param=param.detach().numpy(),
+        grad=param.grad.contiguous().numpy(),
+        mean=moments[0].numpy(),
+        square=moments[1].numpy(),
+        columns=columns,
+        head=columns if rest is None else min(head, columns),
+        count=count,
+        rate_head=rate,
+        rate_rest=rate if rest is None else rest,
+        beta1=BETA1,
+        beta2=BETA2,
+        eps=EPS,
     )

@@ -21,14 +21,14 @@ def save(path: Path, tensors: dict[str, torch.Tensor], record: dict[str, Any]) -
     Raises:
         HostError: the disk is full or the folder cannot be written.
     """
-    from safetensors.torch import save as pack
+    from safetensors.torch import save_file
 
     part = path.with_name(path.name + ".partial")
     text = json.dumps({"format": FORMAT, **jsonable(record)}, allow_nan=False)
     try:
-        with part.open("wb") as file:
-            file.write(pack({k: v.detach().contiguous() for k, v in tensors.items()}, metadata={"spikerig": text}))
-            file.flush()
+        save_file({k: v.detach().contiguous() for k, v in tensors.items()}, part, metadata={"spikerig": text})
+        part.chmod(0o644)  # safetensors makes it private
+        with part.open("rb+") as file:
             os.fsync(file.fileno())
         os.replace(part, path)
     except OSError as error:

@@ -111,7 +111,7 @@ def score(
         _picture_folder(pictures, force)
     same = scene_hash(path) == opened.record["scene"]["sha256"] if path.exists() else True
     if not same:
-        note(f"warning: {path} is not the file this run was trained on")
+        note(f"note: {path} is not the file this run was trained on")
 
     def keep(name: str, picture: Any) -> None:
         if pictures is not None:

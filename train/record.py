@@ -114,7 +114,8 @@ def open_run(folder: Path) -> Run:
     if not (folder / RECORD).exists():
         raise DataError("there is no run here", value=folder, next="spikerig train fit SCENE.h5 -o RUN")
     record = read_json(folder / RECORD)
-    tensors, _ = checkpoint.load(folder / CHECKPOINT)
+    tensors, state = checkpoint.load(folder / CHECKPOINT)
+    record |= {"steps": state.get("step"), "train_seconds": state.get("seconds")}
     try:
         config = from_json(record["config"])
         camera = Camera(record["camera"]["K"], np.zeros(0), record["camera"]["width"], record["camera"]["height"])

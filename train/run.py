@@ -156,6 +156,7 @@ class _Watch:
     checkpoint_every: float
     looked: float = 0.0
     saved: float = field(default_factory=time.monotonic)
+    pause: float = 0.0  # after a save that took long: it may cost a twentieth of the time, not more
     bar: Progress | None = None
 
     def __call__(self, state: State, fraction: float, loss: float) -> None:
@@ -168,7 +169,7 @@ class _Watch:
         self.bar.step(ahead - self.bar.done, extra=f"loss {loss:.4f}")
         if fraction < 1 and self._due(state, fraction):
             self.look(state, fraction)
-        if time.monotonic() - self.saved >= self.checkpoint_every:
+        if time.monotonic() - self.saved >= max(self.checkpoint_every, self.pause):
             self.save(state)
 
     def _due(self, state: State, fraction: float) -> bool:
@@ -189,8 +190,10 @@ class _Watch:
     def save(self, state: State) -> None:
         """Write a checkpoint."""
         check_finite(state)
+        begin = time.monotonic()
         save_state(self.out / records.CHECKPOINT, state, self.task.config)
         self.saved = time.monotonic()
+        self.pause = 20 * (self.saved - begin)
 
 
 def _finish(state: State, watch: _Watch, record: dict[str, Any], ply: bool) -> dict[str, Any]:

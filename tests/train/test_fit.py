@@ -63,6 +63,43 @@ def test_same_bits_for_any_thread_count(tiny, tmp_path, threads, method, changes
     assert len(found) == 1
 
 
+def test_readings_of_w_are_the_same_weight_by_other_names(tiny, tmp_path):
+    pixels = 64 * 40
+    found = {
+        fit(tiny, tmp_path / reading, "spikenerf", eval_every=0, tfs_weight=w, weight_reading=reading)["model_sha256"]
+        for reading, w in (("mean", 10.0), ("sum-image", 10.0 / pixels))
+    }
+    assert len(found) == 1
+    done = fit(tiny, tmp_path / "u8", "spikenerf", eval_every=0, tfs_weight=1e-4, weight_reading="u8")
+    assert done["effective_tfs_weight"] == pytest.approx(6.5025)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"textures": kind, "tfs_combine": combine, "tfs_domain": domain}
+        for kind, combine, domain in (
+            ("tfp", "average", "linear"),
+            ("tfi", "average", "luma"),
+            ("both", "sum", "encoded"),
+            ("raw", "average", "naive"),
+        )
+    ]
+    + [
+        {"poses_per_view": 4, "textures_per_view": 1},
+        {"poses_per_view": 1, "textures_per_view": 3, "fresh_poses": 1},
+        {"poses_per_view": 3, "instants_rule": "endpoints", "pose_label": "first", "highlights": "keep"},
+        {"ratio_until": 1.0, "ratio_instants": 1, "pose_label": "first"},
+        {"ratio_until": 0.5, "ratio_instants": 2, "poses_per_view": 3, "gray": "rec601"},
+        {"opacity_reg": 0.01, "scale_reg": 0.01, "background": "white", "antialias": True, "sh_degree": 2},
+    ],
+)
+def test_every_switch_trains(tiny, tmp_path, changes):
+    done = fit(tiny, tmp_path / "run", "spikenerf", steps=15, eval_every=0, **changes)
+    assert done["steps"] == 15
+    assert done["psnr"] > 10
+
+
 def test_another_seed_is_another_model(tiny, tmp_path):
     a, b = (fit(tiny, tmp_path / str(seed), eval_every=0, seed=seed)["model_sha256"] for seed in (0, 1))
     assert a != b
