@@ -11,10 +11,11 @@ from spikerig.dataset.errors import DataError
 from spikerig.dataset.images import srgb_from_linear
 from spikerig.dataset.scene import Scene
 from spikerig.dataset.store import open_scene, write_scene
+from spikerig.dataset.texture import Texture
 from spikerig.train.config import configure
 from spikerig.train.gauge import Gauge
 from spikerig.train.metrics import psnr
-from spikerig.train.targets import Targets, load_targets, spike_tick, windowed_tfi
+from spikerig.train.targets import Targets, average_texture, load_targets, spike_tick, windowed_tfi
 from spikerig.train.trajectory import instant_ns
 
 UNIT = Gauge((0.0, 0.0, 0.0), 1.0)
@@ -157,3 +158,11 @@ def test_a_rolling_shutter_is_remarked(tiny, tmp_path):
         frame = scene.view(scene.train[0]).frame
     rolling = replace(frame, row_ns=100, start_ns=frame.start_ns - 100 * 20)
     assert "rolling" in targets(changed(tiny, tmp_path, frame=rolling), "plain").remarks[0]
+
+
+def test_the_average_texture_is_over_those_that_know():
+    one = Texture(np.array([[0.2, 0.4, 0.0]], np.float32), np.array([[True, True, False]]), 3.0, "tfp")
+    two = Texture(np.array([[0.4, 0.0, 0.0]], np.float32), np.array([[True, False, False]]), 3.0, "tfi")
+    light, known = average_texture([one, two])
+    np.testing.assert_allclose(light, [[0.3, 0.4, 0.0]], rtol=1e-6)
+    assert known.tolist() == [[True, True, False]]
