@@ -40,7 +40,8 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One measured setting; seconds are medians over repeats, `peak_bytes` is what Python and NumPy allocated."""
+    """One measured setting; seconds are medians over repeats, `peak_bytes` is what Python and NumPy allocated
+    (0: not measured)."""
 
     series: str
     value: Any
@@ -120,9 +121,9 @@ def table(done: Sweep) -> str:
     ]
     for r in done.rows:
         tail = f" {r.note}" if r.note else ""
+        peak = f"{r.peak_bytes / 1e6:.1f}" if r.peak_bytes else "not measured"
         lines.append(
-            f"| {r.series} | {r.value} | {r.error:.4g}{tail} | {r.cpu_seconds:.3g} | {r.wall_seconds:.3g} "
-            f"| {r.peak_bytes / 1e6:.1f} |"
+            f"| {r.series} | {r.value} | {r.error:.4g}{tail} | {r.cpu_seconds:.3g} | {r.wall_seconds:.3g} | {peak} |"
         )
     lines += ["", f"Error against {done.reference}; median of {done.repeats} after one discarded run."]
     lines += [f"Left out: {text}" for text in done.omissions]

@@ -48,3 +48,8 @@ def test_a_file_that_is_no_sweep_is_refused(tmp_path: Path, text: str) -> None:
 def test_an_empty_sweep_is_refused() -> None:
     with pytest.raises(UsageError):
         cost.sweep("t", "t", [], knob="", error_unit="", reference="")
+
+
+def test_the_cost_page_shows_the_saved_sweeps() -> None:
+    docs = Path(__file__).resolve().parents[2] / "docs"
+    assert (docs / "cost.md").read_text(encoding="utf-8") == cost.page(docs / "cost"), "spikerig cost page"
