@@ -22,7 +22,6 @@ METHODS = {
     "demo": ("plain", "average", "spikenerf", "spike-ratio", "oracle"),
     "chroma": ("plain", "average", "spikenerf", "spike-hybrid", "oracle"),
 }
-OURS = ("spike-ratio", "spike-hybrid")
 
 
 @dataclass(frozen=True, slots=True)
