@@ -30,7 +30,8 @@ $(DEPS):
 	@$(PIP) install -q -c constraints.txt torch==2.13.0
 	@$(PIP) install -q -c constraints.txt --group build --group test
 	@$(BIN)/python -c "import tomllib; p = tomllib.load(open('pyproject.toml', 'rb'))['project']; \
-	  print('\n'.join(p['dependencies'] + p['optional-dependencies']['plot']))" > $(VENV)/needs.txt
+	  e = p['optional-dependencies']; \
+	  print('\n'.join(p['dependencies'] + e['plot'] + e['video'] + e['mitsuba'] + e['cluster']))" > $(VENV)/needs.txt
 	@$(PIP) install -q -c constraints.txt -r $(VENV)/needs.txt
 	@$(BIN)/pyright --version > /dev/null 2>&1 || true  # fetches its node package now, not at test time
 	@rm -f $(VENV)/.deps-* && touch $@
