@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from spikerig.dataset.errors import DataError, RigError
 from spikerig.dataset.images import read_image, read_linear
 from spikerig.rigctl.sim.folder import Folder
+from spikerig.rigctl.sim.folder_plan import plan_folder, resolve_folder
 from spikerig.rigctl.sim.limits import Faults
 from spikerig.rigctl.sim.points import read_points
 from spikerig.rigctl.sim.take import Taken, in_parallel, pack, share_of, surface, take_blurry, take_sharp
@@ -87,6 +88,12 @@ def capture_folder(
         DataError: pictures that cannot be used (damaged, of another size, NaN, infinite, negative): all at once.
     """
     faults = Faults("the pictures", DataError, "docs/sim_frames.md says what a picture may hold")
+    info: dict[str, Any] = {"made_by": "spikerig sim frames", "folder": folder.rig.name}
+    told: dict[str, Any] = {}
+    if folder.settings.tolerance is not None:
+        made = plan_folder(folder)
+        folder, told = resolve_folder(folder, made), {"plan": made.as_json(), "plan_line": made.summary()}
+        info["plan"] = told["plan"]
     takes = in_parallel(take_sequence, folder, len(folder.views), workers)
 
     def good() -> Iterator[Taken]:
@@ -97,6 +104,5 @@ def capture_folder(
                 yield taken
         faults.raise_any()
 
-    info = {"made_by": "spikerig sim frames", "folder": folder.rig.name}
     points = read_points(folder.points) if folder.points else None
-    return pack(path, folder.rig, good(), info=info, points=points, force=force, done=done)
+    return pack(path, folder.rig, good(), info=info, points=points, force=force, done=done) | told
