@@ -99,4 +99,4 @@ def capture_folder(
 
     info = {"made_by": "spikerig sim frames", "folder": folder.rig.name}
     points = read_points(folder.points) if folder.points else None
-    return pack(path, folder.rig, good(), info=info, points=points, force=force, done=done)
+    return pack(path, folder.rig, good(), info=info, points=points, views=len(folder.views), force=force, done=done)
