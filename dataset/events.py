@@ -95,7 +95,8 @@ class EventStream:
         first, stop = self.index_range(t0_ns, t1_ns)
         start = min(max(t0_ns, self.t0_ns), self.t1_ns)
         end = max(min(t1_ns, self.t1_ns), start)
-        columns = (column[first:stop] for column in (self.t_ns, self.x, self.y, self.polarity))
+        k = slice(first, stop)
+        columns = self.t_ns[k], self.x[k], self.y[k], self.polarity[k]
         return EventStream(*columns, self.height, self.width, start, end, self.clock)
 
     def accumulate(self, t0_ns: int | None = None, t1_ns: int | None = None) -> NDArray[np.int32]:
@@ -158,5 +159,5 @@ def _column(values: ArrayLike, name: str, dtype: type) -> NDArray:
 
 def no_events(height: int, width: int, t0_ns: int, t1_ns: int, clock: str = "rig") -> EventStream:
     """A span in which nothing changed."""
-    columns = (np.zeros(0, dtype) for dtype in (np.int64, np.uint16, np.uint16, np.int8))
+    columns = np.zeros(0, np.int64), np.zeros(0, np.uint16), np.zeros(0, np.uint16), np.zeros(0, np.int8)
     return EventStream(*columns, height, width, t0_ns, t1_ns, clock)

@@ -60,9 +60,9 @@ def read_events(group: h5py.Group, t0_ns: int | None = None, t1_ns: int | None =
 
 
 def _read(group: h5py.Group, first: int, stop: int, t0_ns: int, t1_ns: int) -> EventStream:
-    columns = (dataset_at(group, name)[first:stop] for name in COLUMNS)
+    t, x, y, polarity = (dataset_at(group, name)[first:stop] for name in COLUMNS)
     height, width, clock = (read_attr(group, key) for key in ("height", "width", "clock"))
-    return EventStream(*columns, height, width, t0_ns, t1_ns, clock)
+    return EventStream(t, x, y, polarity, height, width, t0_ns, t1_ns, clock)
 
 
 def check_events(group: h5py.Group) -> None:
