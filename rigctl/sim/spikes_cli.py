@@ -134,7 +134,7 @@ def _frames_folder(folder: Path, force: bool) -> Iterator[Path]:
 def _camera(folder: Path, retake: Retake, fps: float, exposure_ms: float) -> tuple[Exposures, list[dict[str, Any]]]:
     from spikerig.dataset.images import write_image
     from spikerig.rigctl.sim.retake import Exposures
-    from spikerig.rigctl.sim.sensor import encode
+    from spikerig.rigctl.sim.rgb import encode
 
     shots: list[dict[str, Any]] = []
 

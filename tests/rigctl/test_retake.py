@@ -22,7 +22,7 @@ from spikerig.dataset.spikes import open_spikes
 from spikerig.rigctl.sim import retake as module
 from spikerig.rigctl.sim.moving import Look, Moving, open_moving
 from spikerig.rigctl.sim.retake import Exposures, Retake, knots, spikes_of
-from spikerig.rigctl.sim.sensor import encode
+from spikerig.rigctl.sim.rgb import encode
 
 RNG = np.random.default_rng(0)
 WEIGHTS = np.array([0.299, 0.587, 0.114])
