@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.errors import DataError
-from spikerig.dataset.images import read_image, read_linear
+from spikerig.dataset.exr import read_exr_depth
 from spikerig.rigctl.sim.calibrate import Work, least
 from spikerig.rigctl.sim.folder import Folder, Sequence
 from spikerig.rigctl.sim.looks import LOOK_PARTS, LOOK_PX, VIEWS, Looked, full_map, samples_left, spread
+from spikerig.rigctl.sim.pictures import read_light
 from spikerig.rigctl.sim.plan import Plan, chosen, judged
 from spikerig.rigctl.sim.points import read_points
 from spikerig.rigctl.sim.samples import motion_px, parts_for
@@ -98,7 +99,7 @@ def _light(folder: Folder, view: Sequence, motion: float) -> Light:
 
 def _picture(folder: Folder, view: Sequence, k: int) -> NDArray[np.float32]:
     file, camera = view.files[k], folder.rig.camera
-    light = read_linear(file, background=folder.background)
+    light, _ = read_light(file, background=folder.background, layer=folder.layer, how=folder.bad_values)
     if light.shape[:2] != (camera.height, camera.width):
         raise DataError(
             "a picture of another size", value=f"{file}: {light.shape[1]}x{light.shape[0]}",
@@ -110,7 +111,7 @@ def _picture(folder: Folder, view: Sequence, k: int) -> NDArray[np.float32]:
 def _depth(view: Sequence, xyz: Floats, shape: tuple[int, int]) -> Floats:
     """The view's depth [H,W], as well as it is known."""
     if view.depth is not None:
-        return read_image(view.depth, nonfinite="keep")[:, :, 0]
+        return read_exr_depth(view.depth)
     pose = view.track.poses[len(view.track.poses) // 2]
     z = xyz @ pose[2, :3] + pose[2, 3]
     z = z[z > 0]
