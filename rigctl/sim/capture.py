@@ -78,12 +78,8 @@ def capture(
     if made is not None:
         spec = resolve(spec, made)
     takes = in_parallel(take_view, spec, spec.orbit.views, workers)
-<<<<<<< HEAD
-    told = pack(path, rig_of(spec), takes, info=info, force=force, done=done)
+    told = pack(path, rig_of(spec), takes, info=info, views=spec.orbit.views, force=force, done=done)
     return told | ({} if made is None else {"plan": made.as_json(), "plan_line": made.summary()})
-=======
-    return pack(path, rig_of(spec), takes, info=provenance(spec), views=spec.orbit.views, force=force, done=done)
->>>>>>> main
 
 
 def provenance(spec: SceneSpec, made: Plan | None = None) -> dict[str, Any]:
