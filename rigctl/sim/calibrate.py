@@ -71,10 +71,11 @@ class Costs:
     spent: float
 
 
-def least(work: Callable[[], Any], repeats: int = REPEATS) -> float:
-    """CPU seconds of one run of `work`, threads and all: the least of some repeats."""
+def least(work: Callable[[], Any], repeats: int = REPEATS, before: Callable[[], Any] = lambda: None) -> float:
+    """CPU seconds of one run of `work`, threads and all: the least of some repeats; `before` each is not timed."""
     best = np.inf
     for _ in range(repeats):
+        before()
         began = time.process_time()
         work()
         best = min(best, time.process_time() - began)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from spikerig.dataset.images import srgb_from_linear
-from spikerig.rigctl.sim.effects import Effect, parameters
+from spikerig.rigctl.sim.effects import Effect, Site, Stage, parameters
 from spikerig.rigctl.sim.facts import PART, Bound, Facts
 from spikerig.rigctl.sim.looks import Looked, Samples, look
 from spikerig.rigctl.sim.spec import Exposure, SceneSpec, Tolerance
@@ -112,7 +112,7 @@ def judged(looked: Looked, effects: Sequence[Effect], tolerance: Tolerance | Non
         effects: those to choose from, in the order in which they act.
         tolerance: None keeps all.
     """
-    facts = looked.facts
+    facts = with_dark(looked.facts, effects)
     bounds = {effect.name: effect.magnitude(facts) for effect in effects}
     if tolerance is None:
         rows = tuple(Judged(e, True, bounds[e.name], "listed") for e in effects)
@@ -130,6 +130,24 @@ def judged(looked: Looked, effects: Sequence[Effect], tolerance: Tolerance | Non
             why[name] = _too_much(bound, left, room)
     rows = tuple(Judged(e, e.name not in off, bounds[e.name], why[e.name]) for e in effects)
     return Plan(rows, tolerance, room, (float(left[0]), float(left[1])), looked.samples, looked)
+
+
+def with_dark(facts: Facts, effects: Sequence[Effect]) -> Facts:
+    """Facts with the charge that comes without light: it makes spikes for others to change, even in the dark.
+
+    Args:
+        facts: of the light alone.
+        effects: all there may be, in the order in which they act.
+    """
+    height, width = facts.size
+    site = Site(height, width, 0, 0, facts.rate_hz, 0.0, facts.ticks + 2 * facts.margin_ticks)
+    dark = np.zeros((1, height, width), np.float32)
+    for effect in effects:
+        hooks = effect.begin(site) if effect.stage == Stage.CHARGE else None
+        if hooks is not None and hooks.light is not None and not hooks.per_tick:
+            hooks.light(dark)
+    mean = float(dark.mean())
+    return replace(facts, light=facts.light + mean, light_max=facts.light_max + mean) if mean > 0 else facts
 
 
 def _share(bound: Bound, tolerance: Tolerance) -> float:
@@ -153,7 +171,7 @@ def _too_much(bound: np.ndarray, left: np.ndarray, room: Sequence[float]) -> str
 
 
 def room_of(tolerance: Tolerance, facts: Facts, random_phase: bool) -> tuple[float, float]:
-    """What left-out bounds may sum to so that whole counts and whole digital numbers stay within a tolerance.
+    """What left-out bounds may sum to.
 
     Args:
         tolerance: asked for.
@@ -161,23 +179,21 @@ def room_of(tolerance: Tolerance, facts: Facts, random_phase: bool) -> tuple[flo
         random_phase: whether pixels start at a random charge.
 
     Returns:
-        (spikes an exposure, digital numbers).
-
-    Source:
-        Counts and digital numbers are whole. A change of n + f moves them by n, or by n + 1 in a share f of the pixels,
-        if they lie evenly between the steps: so 1.5 allows 1.05 (one, and in 5 % of the pixels two), and 0.5 allows
-        0.05. Where many lie just beside a step (a picture of few values, every pixel starting empty) only n is left.
+        (spikes an exposure, digital numbers): the tolerance. Bounds count whole steps, for values that lie evenly
+        between them (see `Bound`); where many lie just beside a step (a picture of few values, every pixel starting
+        empty), a change however small may move them all by one, and only whole steps of the tolerance are left.
     """
     counts = np.zeros(0) if random_phase else facts.counts
     values = 255 * srgb_from_linear(np.clip(facts.rgb, 0, 1)) + 0.5
-    rooms = []
-    for allowed, real in ((tolerance.spikes, counts), (tolerance.dn, values)):
-        rooms.append(min(allowed, np.floor(allowed + 1e-9) + (0.0 if _crowded(real) else EVEN)))
-    return float(rooms[0]), float(rooms[1])
+    rooms = [
+        float(np.floor(allowed)) if _crowded(real) else allowed
+        for allowed, real in ((tolerance.spikes, counts), (tolerance.dn, values))
+    ]
+    return rooms[0], rooms[1]
 
 
 def _crowded(values: np.ndarray) -> bool:
-    """Whether more of the values than even ones would lie just above, or just below, a whole number."""
+    """Whether more of the values than of even ones lie just above, or just below, a whole number."""
     if not values.size:
         return False
     rest = values % 1.0
