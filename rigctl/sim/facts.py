@@ -91,8 +91,8 @@ class Facts:
 
     @property
     def rate(self) -> Floats:
-        """float64[n], spikes a tick: the light, at most one."""
-        return np.minimum(self.light, 1.0)
+        """float64[n], spikes a tick: the light, less what is clipped."""
+        return self.light - surplus(self.light, self.light_max)
 
     @property
     def counts(self) -> Floats:
@@ -110,7 +110,8 @@ class Facts:
         The count of a steady pixel moves by the light times the ticks, and not beyond one spike a tick.
         """
         after = change(self.light) if callable(change) else self.light + np.asarray(change)
-        moved = np.clip(after, 0, 1) - self.rate
+        after = np.maximum(after, 0)
+        moved = after - surplus(after, after + (self.light_max - self.light)) - self.rate
         return self.counted(moved * self.ticks, moved * self.margin_ticks, share)
 
     def counted(self, change: Floats, before: Floats | float = 0.0, share: float = 1.0) -> float:
@@ -159,3 +160,15 @@ class Facts:
             both = [self.rgb + np.asarray(change), self.rgb - np.asarray(change)]
         moved = [np.abs(srgb_from_linear(np.clip(after, 0, 1)) - before) for after in both]
         return 255 * self.most(np.max(moved, axis=0))
+
+
+def surplus(mean: Floats, most: Floats) -> Floats:
+    """Light beyond one threshold a tick, on average, of light whose values over time spread evenly around its mean.
+
+    Edges:
+        They reach from twice the mean less the most, or if that is negative from 0 for a part of the time.
+    """
+    least = np.maximum(2 * mean - most, 0)
+    span = np.maximum(most - least, 1e-12)
+    part = np.minimum(1, 2 * mean / np.maximum(most, 1e-12))
+    return np.where(least < 1, part * np.maximum(most - 1, 0) ** 2 / (2 * span), np.maximum(mean - 1, 0))

@@ -91,7 +91,6 @@ class Hooks:
         rgb_optics: the same for the RGB arm; it may see the exposure's mean instead of its samples.
         light: changes light [n,H,W] in place, in thresholds a tick; affine in the light and the same for all ticks, so
             that it may act on knots; each gets what those before it left.
-        per_tick: `light` must see every tick instead; slow, for effects that `pixel` does not know.
         pixel: arguments of the kernel `fire_noisy`, for what differs from tick to tick inside a pixel.
         charge: changes the initial charge float64[H,W] in place, in thresholds.
         bits: (bits uint8[T,H,B], width) changes spikes in place, before they leave the sensor.
@@ -111,7 +110,6 @@ class Hooks:
     spike_optics: Callable[[Floats], Floats] | None = None
     rgb_optics: Callable[[Floats], Floats] | None = None
     light: Callable[[Floats], None] | None = None
-    per_tick: bool = False
     pixel: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     charge: Callable[[NDArray[np.float64]], None] | None = None
     bits: Callable[[NDArray[np.uint8], int], None] | None = None

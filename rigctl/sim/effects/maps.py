@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.errors import DataError
 from spikerig.rigctl.sim.effects import Floats, Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import Bound, Facts
+from spikerig.rigctl.sim.facts import Bound, Facts, surplus
 from spikerig.rigctl.sim.limits import limits
 
 MOST_PIXELS = 1 << 26
@@ -73,8 +73,8 @@ class SensorMap:
         gain, dark, noise = cropped(read_maps(self.file), *facts.size, self.file)
         n = max(1, -(-8192 // max(1, facts.light.size)))
         pick = np.random.default_rng(95).integers(0, gain.size, (n, facts.light.size))
-        after = np.clip(facts.light * gain.reshape(-1)[pick] + dark.reshape(-1)[pick], 0, 1)
-        moved = after - facts.rate
+        after = facts.light * gain.reshape(-1)[pick] + dark.reshape(-1)[pick]
+        moved = after - surplus(after, after + (facts.light_max - facts.light)) - facts.rate
         sd = 0.0 if noise is None else float(np.median(noise))
         start, end = (sd * (np.abs(z) + 2) for z in facts.normal(2)[:, :n])
         spikes = facts.counted(moved * facts.ticks + end - start, moved * facts.margin_ticks + start)

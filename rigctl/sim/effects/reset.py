@@ -18,7 +18,7 @@ class ResetLoss:
         loss: share of a tick that a reset takes.
     """
 
-    loss: float = limits(0.002, 0, 1, "of a tick's charge")
+    loss: float = limits(0.002, 0, 0.99, "of a tick's charge")
 
     name: ClassVar[str] = "reset_loss"
     stage: ClassVar[Stage] = Stage.CHARGE
