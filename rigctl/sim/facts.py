@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.images import srgb_from_linear
+
+if TYPE_CHECKING:
+    from spikerig.rigctl.sim.sensor import Light
 
 Floats = NDArray[np.floating]
 PART = 95.0  # a bound holds for this share of the pixels, percent
@@ -54,6 +58,9 @@ class Facts:
         views: how many.
         period_s: from one exposure to the next.
         depth: (nearest, median) distance along the axis, world units; infinite where not known.
+        looks: the light of the surveyed views, for effects whose change is not a function of single pixels.
+        means: of each look, the exposure's mean light on the spike sensor float64[H,W] and in RGB float64[H,W,3].
+        response: of the spike sensor to linear red, green and blue, thresholds a tick.
     """
 
     light: Floats
@@ -75,6 +82,9 @@ class Facts:
     views: int
     period_s: float
     depth: tuple[float, float] = (np.inf, np.inf)
+    looks: tuple[Light, ...] = ()
+    means: tuple[tuple[Floats, Floats], ...] = ()
+    response: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def exposure_s(self) -> float:
@@ -95,6 +105,14 @@ class Facts:
         """The value that 95 % of the pixels stay below; of a change [n] or [n,3]."""
         values = np.asarray(values, np.float64)
         return float(np.percentile(np.abs(values), PART)) if values.size else 0.0
+
+    def count_change(self, before: Floats, after: Floats) -> Floats:
+        """By how much counts differ between two lights, thresholds a tick; any shape."""
+        return np.abs(np.clip(after, 0, 1) - np.clip(before, 0, 1)) * self.ticks
+
+    def dn_change(self, before: Floats, after: Floats) -> Floats:
+        """By how much RGB values differ between two linear lights, digital numbers of 255; any shape."""
+        return 255 * np.abs(srgb_from_linear(np.clip(after, 0, 1)) - srgb_from_linear(np.clip(before, 0, 1)))
 
     def spikes(self, change: Floats | Callable[[Floats], Floats]) -> float:
         """Change of the spike count when the light changes: by an amount [n] in thresholds a tick, or to a function's.

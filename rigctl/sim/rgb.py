@@ -47,6 +47,21 @@ def window_weights(light: Light, begin: NDArray[np.float64]) -> NDArray[np.float
     return weights
 
 
+def wave_means(light: Light, hz: float) -> tuple[Floats, Floats]:
+    """Mean over the exposure of linear light x cos and x sin of 2 pi hz t, t from its start; float64[H,W,3] each."""
+    begin, end = light.exposure
+    at = begin + (np.arange(4096) + 0.5) * ((end - begin) / 4096)
+    knots = light.knots.astype(np.float64)
+    k = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
+    later = np.zeros(len(at)) if light.hold else (at - knots[k]) / (knots[k + 1] - knots[k])
+    angle = 2 * np.pi * hz * (at - begin) / light.rate_hz
+    means = []
+    for wave in (np.cos(angle) / 4096, np.sin(angle) / 4096):
+        share = np.bincount(k, wave * (1 - later), len(knots)) + np.bincount(k + 1, wave * later, len(knots))
+        means.append(np.tensordot(share[: len(light.rgb)], light.rgb, 1))
+    return means[0], means[1]
+
+
 def expose(light: Light, row_ns: float = 0.0) -> NDArray[np.float64]:
     """Mean linear light on the RGB arm over the exposure, float64[H,W,3].
 
