@@ -69,7 +69,8 @@ def simulate(
         raise UsageError("an effect is listed twice", value=", ".join(sorted(n for n in names if names.count(n) > 1)))
     height, width = light.rgb.shape[1:3]
     ticks = int(light.knots[-1] - light.knots[0])
-    site = Site(height, width, view, seed, light.rate_hz, light.t0_ns * 1e-9, ticks, camera)
+    own_arm = light.arm is not None
+    site = Site(height, width, view, seed, light.rate_hz, light.t0_ns * 1e-9, ticks, camera, own_arm)
     steps = [effect.begin(site) for effect in in_order(effects)]
     light = _lit(light, steps)
     spikes, start, left, clipped = _spikes(light, sensor, steps)

@@ -53,6 +53,7 @@ class Site:
         t0_s: the rig's time at the first tick of the view, seconds from the start of the take.
         ticks: of the view's spikes, margins included.
         camera: the pinhole that both arms share before any misalignment.
+        own_arm: the RGB arm's light was cast from its own pose already.
     """
 
     height: int
@@ -63,6 +64,7 @@ class Site:
     t0_s: float = 0.0
     ticks: int = 1
     camera: Camera | None = None
+    own_arm: bool = False
 
     def draw(self, effect: str) -> np.random.Generator:
         """The effect's own stream for this view."""
@@ -152,6 +154,15 @@ class Effect(Protocol):
 # name -> module and class. A table, not a registry: importing this module imports no effect.
 # Effects of one stage act in the order of the table.
 EFFECTS: Mapping[str, tuple[str, str]] = {
+    "flicker": ("flicker", "Flicker"),
+    "brightness_ramp": ("ramp", "BrightnessRamp"),
+    "splitter": ("splitter", "Splitter"),
+    "misalignment": ("misalignment", "Misalignment"),
+    "ghost": ("ghost", "Ghost"),
+    "mirror_flip": ("flip", "MirrorFlip"),
+    "distortion": ("distortion", "Distortion"),
+    "defocus": ("defocus", "Defocus"),
+    "vignetting": ("vignetting", "Vignetting"),
     "shot_noise": ("shot", "ShotNoise"),
     "prnu": ("prnu", "Prnu"),
     "sensor_map": ("maps", "SensorMap"),
@@ -172,7 +183,15 @@ EFFECTS: Mapping[str, tuple[str, str]] = {
     "clock_wander": ("clock", "ClockWander"),
     "clock_jitter": ("clock", "ClockJitter"),
     "clock_reset": ("clock", "ClockReset"),
+    "rolling_shutter": ("rolling", "RollingShutter"),
+    "rgb_noise": ("rgb_noise", "RgbNoise"),
+    "bayer": ("bayer", "Bayer"),
+    "white_balance": ("balance", "WhiteBalance"),
+    "response_curve": ("response", "ResponseCurve"),
     "read_noise": ("read", "ReadNoise"),
+    "bit_depth": ("bits", "BitDepth"),
+    "jpeg": ("jpeg", "Jpeg"),
+    "video_codec": ("video", "VideoCodec"),
 }
 
 

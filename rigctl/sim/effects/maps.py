@@ -47,7 +47,7 @@ class SensorMap:
     stage: ClassVar[Stage] = Stage.CHARGE
     per: ClassVar[str] = "knot"
     source: ClassVar[str] = "the sensor's own flat fields; RSIR (MM 2023) calibrates the same two maps"
-    vanishes: ClassVar[str] = "gain = 1, dark = 0, no noise"
+    vanishes: ClassVar[str] = "gain = 1, dark = 0, no noise; or no file"
     cost_ns: ClassVar[float] = 0.9
     excludes: ClassVar[tuple[str, ...]] = ("prnu", "dark_current", "threshold_fpn")
 
@@ -59,6 +59,8 @@ class SensorMap:
 
     def begin(self, site: Site) -> Hooks:
         """The part of the maps that the picture covers."""
+        if not self.file:
+            return Hooks(light=lambda block: None)
         gain, dark, noise = cropped(read_maps(self.file), site.height, site.width, self.file)
 
         def light(block: Floats) -> None:
@@ -70,6 +72,8 @@ class SensorMap:
 
     def magnitude(self, facts: Facts) -> Bound:
         """Light x (gain - 1) + dark, over all pairs of light and a sample of the map; noise at both ends."""
+        if not self.file:
+            return Bound(0.0, 0.0, "no maps")
         gain, dark, noise = cropped(read_maps(self.file), *facts.size, self.file)
         n = max(1, -(-8192 // max(1, facts.light.size)))
         pick = np.random.default_rng(95).integers(0, gain.size, (n, facts.light.size))
