@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,12 +135,12 @@ class Effect(Protocol):
     effect with its file found from the folder of the scene file (or a RigError).
     """
 
-    name: str
-    stage: Stage
-    per: str
-    source: str
-    vanishes: str
-    cost_ns: float
+    name: ClassVar[str]
+    stage: ClassVar[Stage]
+    per: ClassVar[str]
+    source: ClassVar[str]
+    vanishes: ClassVar[str]
+    cost_ns: ClassVar[float]
 
     def begin(self, site: Site) -> Hooks:
         """Ready for one view."""
