@@ -18,8 +18,8 @@ COLUMNS = ("rate", "regular", "count_variance", "phase_variance", "fpn")
 def statistics(
     source: Annotated[str, typer.Argument(help="A file of spikes, or a scene (TOML or built-in name): its view 0.")],
     preset: Annotated[
-        str, typer.Option(help="Also of a simulated twin: the same light, seen by this sensor preset.")
-    ] = "",
+        list[str] | None, typer.Option(help="Also of a simulated twin: the same light, seen by this sensor preset.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of the twin's noise.")] = 0,
     axes: Annotated[str | None, typer.Option(help="Order of a foreign .npz array: THW or HWT.")] = None,
     height: Annotated[int | None, typer.Option(help="Of a raw raster.")] = None,
@@ -40,8 +40,8 @@ def statistics(
         with open_spikes(source, axes=axes, height=height, width=width, row_bits=row_bits) as file:
             stream = file.read(0, min(ticks, file.ticks))
     rows = {"spikes": _both(stream)}
-    if preset:
-        rows[preset] = _both(_twin(stream, preset, seed))
+    for name in preset or ():
+        rows[name] = _both(_twin(stream, name, seed))
     if as_json:
         emit("spikerig.sim.statistics/1", {"source": source, "ticks": stream.ticks, "statistics": rows})
     note(f"{source}: {stream.ticks} ticks of {stream.width}x{stream.height}")

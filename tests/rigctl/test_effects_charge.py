@@ -147,7 +147,7 @@ def archive(path, height: int = 8, width: int = 10, **changes: np.ndarray) -> st
     rng = np.random.default_rng(4)
     gain = rng.normal(1, 0.05, (height, width)).astype(np.float32)
     arrays = {"gain": gain / gain.mean(), "dark": rng.uniform(0, 0.01, (height, width)).astype(np.float32)}
-    np.savez(path, **(arrays | changes))
+    np.savez(path, allow_pickle=True, **(arrays | changes))
     return str(path)
 
 

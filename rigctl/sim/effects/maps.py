@@ -48,7 +48,7 @@ class SensorMap:
     per: ClassVar[str] = "knot"
     source: ClassVar[str] = "the sensor's own flat fields; RSIR (MM 2023) calibrates the same two maps"
     vanishes: ClassVar[str] = "gain = 1, dark = 0, no noise; or no file"
-    cost_ns: ClassVar[float] = 0.9
+    cost_ns: ClassVar[float] = 2.0
     excludes: ClassVar[tuple[str, ...]] = ("prnu", "dark_current", "threshold_fpn")
 
     def placed(self, folder: Path) -> SensorMap:

@@ -29,7 +29,7 @@ class Saturation:
     per: ClassVar[str] = "tick"
     source: ClassVar[str] = "SpikeCV, S-SDM and SpikingSIM: soft reset without a limit; one read-out a tick clips"
     vanishes: ClassVar[str] = "mode = clip, or light below one threshold a tick"
-    cost_ns: ClassVar[float] = 0.5
+    cost_ns: ClassVar[float] = 0.06
 
     def begin(self, site: Site) -> Hooks:
         """What the kernel does with the surplus."""
