@@ -26,15 +26,15 @@ class Simulated:
         frame: sRGB, 8 bits.
         blurry: float64[H,W,3], the exposure's mean linear light before any response.
         start: float64[H,W], charge before the first tick, thresholds.
-        left: uint32[H,W], charge after the last tick, 2^-32 thresholds.
-        clipped: float64[H,W], charge beyond one spike a tick, thresholds.
+        left: uint32 or int64 [H,W], charge after the last tick, 2^-32 thresholds.
+        clipped: float64[H,W], charge beyond one spike a tick (or gone in a reset), thresholds.
     """
 
     spikes: SpikeStream
     frame: Frame
     blurry: NDArray[np.float64]
     start: NDArray[np.float64]
-    left: NDArray[np.uint32]
+    left: NDArray[np.uint32] | NDArray[np.int64]
     clipped: NDArray[np.float64]
 
 
@@ -69,7 +69,8 @@ def simulate(
         raise UsageError("an effect is listed twice", value=", ".join(sorted(n for n in names if names.count(n) > 1)))
     height, width = light.rgb.shape[1:3]
     ticks = int(light.knots[-1] - light.knots[0])
-    site = Site(height, width, view, seed, light.rate_hz, light.t0_ns * 1e-9, ticks, camera)
+    own_arm = light.arm is not None
+    site = Site(height, width, view, seed, light.rate_hz, light.t0_ns * 1e-9, ticks, camera, own_arm)
     steps = [effect.begin(site) for effect in in_order(effects)]
     light = _lit(light, steps)
     spikes, start, left, clipped = _spikes(light, sensor, steps)
@@ -94,7 +95,7 @@ def _lit(light: Light, steps: Sequence[Hooks]) -> Light:
 
 def _spikes(
     light: Light, sensor: Sensor, steps: Sequence[Hooks]
-) -> tuple[SpikeStream, NDArray[np.float64], NDArray[np.uint32], NDArray[np.float64]]:
+) -> tuple[SpikeStream, NDArray[np.float64], NDArray[np.uint32] | NDArray[np.int64], NDArray[np.float64]]:
     """The spike arm: stream, charge before, charge left, charge clipped."""
     height, width = light.rgb.shape[1:3]
     seen = spike_light(light.rgb, sensor)
