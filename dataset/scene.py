@@ -140,7 +140,9 @@ class Frame:
     @property
     def pixels8(self) -> NDArray[np.uint8]:
         """The pixels in 8 bits, rounded where they have more."""
-        return self.pixels if self.full == 255 else np.rint(self.pixels / 257).astype(np.uint8)
+        return (
+            np.rint(self.pixels / 257).astype(np.uint8) if self.full > 255 else self.pixels.astype(np.uint8, copy=False)
+        )
 
     @property
     def mid_ns(self) -> int:
