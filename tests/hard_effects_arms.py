@@ -27,9 +27,11 @@ def still(picture: np.ndarray, ticks: int = 400) -> Light:
 
 
 def run(light: Light, *effects: Effect, seed: int = 1, view: int = 0) -> Simulated:
-    """Simulated with a camera of 60 degrees."""
+    """Simulated with a camera of 60 degrees along the longer side."""
     height, width = light.rgb.shape[1:3]
-    return simulate(light, Sensor(), effects, seed, view, Camera.pinhole(width, height, 60))
+    f = max(height, width) / 2 / np.tan(np.radians(30))
+    camera = Camera(np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]]), np.zeros(0), width, height)
+    return simulate(light, Sensor(), effects, seed, view, camera)
 
 
 def same(a: Simulated, b: Simulated) -> bool:

@@ -32,7 +32,7 @@ class Jpeg:
     stage: ClassVar[Stage] = Stage.RGB
     per: ClassVar[str] = "frame"
     source: ClassVar[str] = "ITU-T T.81 through OpenCV's libjpeg-turbo"
-    vanishes: ClassVar[str] = 'left out; quality = 100 with colour = "4:4:4" stays within 2 codes'
+    vanishes: ClassVar[str] = 'left out; quality = 100 with colour = "4:4:4" stays within 4 codes'
     cost_ns: ClassVar[float] = 40.0
 
     def begin(self, site: Site) -> Hooks:
