@@ -101,8 +101,8 @@ class Facts:
 
     @property
     def rate(self) -> Floats:
-        """float64[n], spikes a tick: the light, at most one."""
-        return np.minimum(self.light, 1.0)
+        """float64[n], spikes a tick: the light, less what is clipped."""
+        return self.light - surplus(self.light, self.light_max)
 
     @property
     def counts(self) -> Floats:
@@ -120,7 +120,9 @@ class Facts:
         The count of a steady pixel moves by the light times the ticks, and not beyond one spike a tick.
         """
         after = change(self.light) if callable(change) else self.light + np.asarray(change)
-        return self.spikes_between(self.light, after, share)
+        after = np.maximum(after, 0)
+        moved = after - surplus(after, after + (self.light_max - self.light)) - self.rate
+        return self.counted(moved * self.ticks, moved * self.margin_ticks, share)
 
     def spikes_between(self, before: Floats, after: Floats, share: float = 1.0) -> float:
         """Change of the spike count between two lights, thresholds a tick; any shapes that go together."""
@@ -174,3 +176,15 @@ class Facts:
         """Change of an RGB value between two linear lights; whole values, so told as `counted` tells counts."""
         codes = [srgb_from_linear(np.clip(light, 0, 1)) for light in (before, after)]
         return self.counted(255 * (codes[1] - codes[0]))
+
+
+def surplus(mean: Floats, most: Floats) -> Floats:
+    """Light beyond one threshold a tick, on average, of light whose values over time spread evenly around its mean.
+
+    Edges:
+        They reach from twice the mean less the most, or if that is negative from 0 for a part of the time.
+    """
+    least = np.maximum(2 * mean - most, 0)
+    span = np.maximum(most - least, 1e-12)
+    part = np.minimum(1, 2 * mean / np.maximum(most, 1e-12))
+    return np.where(least < 1, part * np.maximum(most - 1, 0) ** 2 / (2 * span), np.maximum(mean - 1, 0))

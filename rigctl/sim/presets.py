@@ -6,6 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from spikerig.dataset.errors import UsageError
+from spikerig.rigctl.sim.effects import Effect, read_effects
+from spikerig.rigctl.sim.limits import Faults
+
 
 @dataclass(frozen=True, slots=True)
 class Preset:
@@ -75,3 +79,18 @@ def preset_effects(*names: str, map: str = "") -> list[Mapping[str, Any]]:
     """The effect tables of presets, in order; empty names give none. `map`: the file of `vidar-map`."""
     tables = [table for name in names if name for table in PRESETS[name].effects]
     return tables + ([{"name": "sensor_map", "file": map}] if map and "vidar-map" in names else [])
+
+
+def sensor_effects(name: str) -> list[Effect]:
+    """The effects of a spike camera's preset, and the random phase that any has.
+
+    Raises:
+        UsageError: no such preset, or one that needs a map.
+    """
+    if name not in preset_names("spike")[1:] or name == "vidar-map":
+        known = [n for n in preset_names("spike")[1:] if n != "vidar-map"]
+        raise UsageError("no such sensor preset", value=name, expected=", ".join(known))
+    faults = Faults(f"preset {name}")
+    found = read_effects([*PRESETS[name].effects, "initial_phase"], faults)
+    faults.raise_any()
+    return list(found.values())

@@ -26,15 +26,15 @@ class Simulated:
         frame: sRGB, 8 bits.
         blurry: float64[H,W,3], the exposure's mean linear light before any response.
         start: float64[H,W], charge before the first tick, thresholds.
-        left: uint32[H,W], charge after the last tick, 2^-32 thresholds.
-        clipped: float64[H,W], charge beyond one spike a tick, thresholds.
+        left: uint32 or int64 [H,W], charge after the last tick, 2^-32 thresholds.
+        clipped: float64[H,W], charge beyond one spike a tick (or gone in a reset), thresholds.
     """
 
     spikes: SpikeStream
     frame: Frame
     blurry: NDArray[np.float64]
     start: NDArray[np.float64]
-    left: NDArray[np.uint32]
+    left: NDArray[np.uint32] | NDArray[np.int64]
     clipped: NDArray[np.float64]
 
 
@@ -95,7 +95,7 @@ def _lit(light: Light, steps: Sequence[Hooks]) -> Light:
 
 def _spikes(
     light: Light, sensor: Sensor, steps: Sequence[Hooks]
-) -> tuple[SpikeStream, NDArray[np.float64], NDArray[np.uint32], NDArray[np.float64]]:
+) -> tuple[SpikeStream, NDArray[np.float64], NDArray[np.uint32] | NDArray[np.int64], NDArray[np.float64]]:
     """The spike arm: stream, charge before, charge left, charge clipped."""
     height, width = light.rgb.shape[1:3]
     seen = spike_light(light.rgb, sensor)

@@ -277,9 +277,10 @@ def _effects(top: _Top, presets: list[Mapping[str, Any]], phase: str, faults: Fa
     for name, effect in found.items():
         for other in set(getattr(effect, "excludes", ())) & set(found):
             faults.add("effects", f"list {name} and {other}: the same thing would count twice")
-        if hasattr(effect, "placed"):
+        placed = getattr(effect, "placed", None)
+        if placed is not None:
             try:
-                found[name] = effect.placed(Path(faults.source).parent)
+                found[name] = placed(Path(faults.source).parent)
             except RigError as error:
                 faults.add(f"effects.{name}", f"{error.what}: {error.value}")
     return in_order(found.values())

@@ -239,7 +239,9 @@ def pack(
 
 
 def true_clock(rig: Rig, views: int) -> ClockModel:
-    """The exact map from the spike camera's time to the rig's: a knot at both ends of each view's spikes.
+    """The exact map from the spike camera's time to the rig's: knots over each view's spikes.
+
+    They lie at start, middle and end of each exposure and at the ends of its margins, straight in between.
 
     Raises:
         UsageError: the clock steps back from one view to the next.
@@ -248,16 +250,16 @@ def true_clock(rig: Rig, views: int) -> ClockModel:
     if not clocks or not views:
         return ClockModel.identity()
     exposure, margin = rig.exposure, rig.exposure.margin_ticks
-    ends = np.rint(np.array([-margin, exposure.ticks + margin]) * exposure.tick_ns).astype(np.int64)
-    at_ns = np.array([start_ns(exposure, number) + ends for number in range(views)])
+    ticks = np.unique([-margin, 0, exposure.ticks / 2, exposure.ticks, exposure.ticks + margin])
+    at_ns = np.array([start_ns(exposure, k) + np.rint(ticks * exposure.tick_ns) for k in range(views)]).astype(np.int64)
     ahead = np.zeros(at_ns.shape)
-    for number, both in enumerate(at_ns):
-        t0_s = float(both[0]) * 1e-9
+    for number, times in enumerate(at_ns):
+        t0_s = float(times[0]) * 1e-9
         site = Site(rig.camera.height, rig.camera.width, number, rig.seed, exposure.rate_hz, t0_s)
         for effect in clocks:
             clock = effect.begin(site).clock_ns
             if clock is not None:
-                ahead[number] += clock(both)
+                ahead[number] += clock(times)
     rig_ns = at_ns.reshape(-1)
     return ClockModel(rig_ns + np.rint(ahead.reshape(-1)).astype(np.int64), rig_ns, np.zeros(len(rig_ns)), 0.0)
 

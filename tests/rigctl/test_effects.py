@@ -73,10 +73,10 @@ def test_an_effect_left_out_is_not_imported() -> None:
 
 
 def test_an_effect_left_out_is_not_called(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a per-tick effect, light is only touched at its knots."""
+    """Without an effect inside the pixel, the noisy kernel does not run."""
     import spikerig.rigctl.sim.sensor as sensor
 
-    monkeypatch.setattr(sensor, "_ticks", lambda *a: pytest.fail("light was made for every tick"))
+    monkeypatch.setattr(sensor, "fire_noisy", lambda *a, **k: pytest.fail("the kernel that draws every tick"))
     run(DarkCurrent(), ThresholdFpn(), InitialPhase(), ReadNoise())
     with pytest.raises(BaseException, match="every tick"):
         run(ShotNoise())

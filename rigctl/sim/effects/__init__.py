@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,7 +93,6 @@ class Hooks:
         rgb_optics: the same for the RGB arm; it may see the exposure's mean instead of its samples.
         light: changes light [n,H,W] in place, in thresholds a tick; affine in the light and the same for all ticks, so
             that it may act on knots; each gets what those before it left.
-        per_tick: `light` must see every tick instead; slow, for effects that `pixel` does not know.
         pixel: arguments of the kernel `fire_noisy`, for what differs from tick to tick inside a pixel.
         charge: changes the initial charge float64[H,W] in place, in thresholds.
         bits: (bits uint8[T,H,B], width) changes spikes in place, before they leave the sensor.
@@ -113,7 +112,6 @@ class Hooks:
     spike_optics: Callable[[Floats], Floats] | None = None
     rgb_optics: Callable[[Floats], Floats] | None = None
     light: Callable[[Floats], None] | None = None
-    per_tick: bool = False
     pixel: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     charge: Callable[[NDArray[np.float64]], None] | None = None
     bits: Callable[[NDArray[np.uint8], int], None] | None = None
@@ -137,12 +135,12 @@ class Effect(Protocol):
     effect with its file found from the folder of the scene file (or a RigError).
     """
 
-    name: str
-    stage: Stage
-    per: str
-    source: str
-    vanishes: str
-    cost_ns: float
+    name: ClassVar[str]
+    stage: ClassVar[Stage]
+    per: ClassVar[str]
+    source: ClassVar[str]
+    vanishes: ClassVar[str]
+    cost_ns: ClassVar[float]
 
     def begin(self, site: Site) -> Hooks:
         """Ready for one view."""
