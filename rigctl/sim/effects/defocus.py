@@ -32,7 +32,7 @@ class Defocus:
     per: ClassVar[str] = "knot"
     source: ClassVar[str] = "geometric optics: the aperture's image, a disk of variance radius^2 / 4 on each axis"
     vanishes: ClassVar[str] = "radius_px = 0"
-    cost_ns: ClassVar[float] = 20.0
+    cost_ns: ClassVar[float] = 2.0
 
     @property
     def kernel(self) -> NDArray[np.float64]:

@@ -43,7 +43,7 @@ class Flicker:
     per: ClassVar[str] = "knot"
     source: ClassVar[str] = "power of a resistive lamp: sin^2 of the mains phase; depths: IEEE 1789-2015"
     vanishes: ClassVar[str] = "depth = 0"
-    cost_ns: ClassVar[float] = 10.0
+    cost_ns: ClassVar[float] = 20.0
 
     @property
     def step_s(self) -> float:
