@@ -109,8 +109,7 @@ def take_blurry(
     t0_ns = start_ns(exposure, number) + round(first * exposure.tick_ns)
     light = Light(rgb, plan.knots - first, (-first, exposure.ticks - first), exposure.rate_hz, t0_ns, arm)
     seen = simulate(light, rig.sensor, rig.effects, rig.seed, number, rig.camera)
-    full = 255 / np.iinfo(seen.frame.pixels.dtype).max
-    error = seen.frame.pixels * full - encode(sharp)
+    error = seen.frame.pixels * (255 / seen.frame.full) - encode(sharp)
     counts = count(seen.spikes.bits, rig.camera.width, -first, exposure.ticks - first)
     blur_db = 20 * np.log10(255 / max(float(np.sqrt(np.mean(error**2))), 1e-9))
     view = replace(view, frame=seen.frame, spikes=seen.spikes, trajectory=path)
@@ -149,7 +148,9 @@ def surface(rig: Rig, number: int, cloud: Cloud, share: int, view: View, depth: 
     y, x = np.divmod(picked, camera.width)
     K = camera.K
     rays = np.stack([(x + 0.5 - K[0, 2]) / K[0, 0], (y + 0.5 - K[1, 2]) / K[1, 1], np.ones(len(picked))], 1)
-    return Points((rays * z[:, None] - pose[:, 3]) @ pose[:, :3], view.frame.pixels.reshape(-1, 3)[picked], "simulator")
+    return Points(
+        (rays * z[:, None] - pose[:, 3]) @ pose[:, :3], view.frame.pixels8.reshape(-1, 3)[picked], "simulator"
+    )
 
 
 def share_of(total: int, rank: int, views: int) -> int:
