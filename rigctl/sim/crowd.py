@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.rigctl.sim.hits import NEAR, TINY, Axes, Floats, vec3
+from spikerig.rigctl.sim.hits import NEAR, TINY, Axes, Floats, dot3, vec3
 from spikerig.rigctl.sim.parts import SIDES, Ints, Parts, Vector, inner_normal, meet, present, surface
 from spikerig.rigctl.sim.solids import Vec3
 
@@ -110,7 +110,7 @@ class Crowd:
         dark = np.zeros(len(away[0]), bool)
         for point, who in self._candidates(lamp, away):
             M = self.local[who]
-            d = axes3(sum(M[:, k, j] * away[j][point] for j in range(3)) + TINY for k in range(3))
+            d = axes3(dot3(list(M[:, k].T), [c[point] for c in away]) + TINY for k in range(3))
             o = axes3(start[:, k][who] for k in range(3))
             for _, _, _, at in self._hits(who, o, d, np.broadcast_to(BEFORE, point.shape)):
                 dark[point[at]] = True
@@ -125,12 +125,13 @@ class Crowd:
                 yield np.repeat(some, len(everyone)), np.tile(everyone, len(some))
             return
         R, lo, scale, begin, member = grid
-        z = sum(away[j] * np.float32(R[2, j]) for j in range(3))
+        R32 = R.astype(np.float32)
+        z = dot3(R32[2], away)
         cell = np.zeros(z.shape, np.int64)
         inside = z > 0
         with np.errstate(divide="ignore", invalid="ignore"):
             for k in (1, 0):
-                at = (sum(away[j] * np.float32(R[k, j]) for j in range(3)) / z - lo[k]) * scale[k]
+                at = (dot3(R32[k], away) / z - lo[k]) * scale[k]
                 inside &= (at >= 0) & (at < CELLS)
                 cell = cell * CELLS + np.where(inside, at, 0).astype(np.int64)
         points = np.flatnonzero(inside)
@@ -173,15 +174,15 @@ class Crowd:
         part, side = np.divmod(number - self.first, self.parts.sides)
         M, c = self.local[part], self.centre[part]
         away = [p[k] - c[:, k] for k in range(3)]
-        q = axes3(sum(M[:, k, j] * away[j] for j in range(3)) for k in range(3))
+        q = axes3(dot3(list(M[:, k].T), away) for k in range(3))
         return part, side, q, surface(self.parts, part, q, side)
 
     def normals(self, part: Ints, side: Ints, q: Vector) -> Vector:
         """Unit normals of places in the parts' own axes, on the side that is seen."""
         inner = inner_normal(self.parts.shape, np.stack(q), side)
         M = self.local[part]
-        n = [sum(M[:, k, j] * inner[k] for k in range(3)) for j in range(3)]
-        size = 1 / np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2])
+        n = [dot3(list(M[:, :, j].T), list(inner)) for j in range(3)]
+        size = 1 / np.sqrt(dot3(n, n))
         return axes3(c * size for c in n)
 
 

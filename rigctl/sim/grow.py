@@ -169,15 +169,13 @@ def _layer(rng: np.random.Generator, height: NDArray[np.int_], layer: int) -> li
     for x, y in np.argwhere(free):
         if not free[x, y]:
             continue
-        for wide, deep in rng.permutation([(2, 2), (2, 1), (1, 2), (1, 1)]):
-            block = free[x : x + wide, y : y + deep]
-            if block.shape == (wide, deep) and block.all():
-                break
-        block[:] = False
+        sizes = [(int(wide), int(deep)) for wide, deep in rng.permutation([(2, 2), (2, 1), (1, 2), (1, 1)])]
+        wide, deep = next(s for s in sizes if (b := free[x : x + s[0], y : y + s[1]]).shape == s and b.all())
+        free[x : x + wide, y : y + deep] = False
         around = height[max(x - 1, 0) : x + wide + 1, max(y - 1, 0) : y + deep + 1]
         edge = x == 0 or y == 0 or x + wide == len(height) or y + deep == height.shape[1]
         if edge or around.min() <= layer + 1:
-            found.append((int(x), int(y), int(wide), int(deep), layer))
+            found.append((int(x), int(y), wide, deep, layer))
     return found
 
 

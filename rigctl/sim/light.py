@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
@@ -138,7 +139,7 @@ class Stage:
             self._maps[number, flip] = light_map(world, face, flip, self.texel, self.crowds)
         light = self._maps[number, flip].at(u, v)
         if face.texture.gloss > 0 and not matt:
-            return glossy(world, face.texture, colour, p, face.normals(p, flip), o, light, self._around)
+            return glossy(world, face.texture, colour, p, face.normals(p, flip), o, light, self._around(o))
         return _matt(world, colour, light)
 
     def _crowded(self, number: int, faces: NDArray[np.int32], p: Axes, o: Axes) -> Floats:
@@ -155,22 +156,26 @@ class Stage:
             return colour * np.float32(parts.texture.emit)
         light = table.at(part, side, s, t)
         if parts.texture.gloss > 0:
-            return glossy(world, parts.texture, colour, p, crowd.normals(part, side, q), o, light, self._around)
+            return glossy(world, parts.texture, colour, p, crowd.normals(part, side, q), o, light, self._around(o))
         return _matt(world, colour, light)
 
-    def _around(self, p: Axes, d: Axes) -> Floats:
+    def _around(self, o: Axes) -> Callable[[Axes, Axes], Floats]:
+        """What gives the light that comes to points from directions, for a camera at `o`."""
+        return lambda p, d: self._arriving(p, d, o)
+
+    def _arriving(self, p: Axes, d: Axes, o: Axes) -> Floats:
         """Light float32[3,n] that comes to points from directions: that of the room, matt, or of the sky."""
+        p, d = [np.asarray(c) for c in p], [np.asarray(c + TINY) for c in d]
         light = np.empty((3, len(p[0])), np.float32)
         light[:] = np.array(self.world.sky, np.float32)[:, None]
         depth, face = np.full(len(p[0]), np.inf, np.float32), np.full(len(p[0]), -1, np.int32)
-        d = [c + TINY for c in d]
         for solid, first in self.solids:
             if isinstance(solid, Room):
                 HIT[Room](solid, first, p, d, depth, face)
         for number in np.unique(face[face >= 0]):
             here = np.flatnonzero(face == number)
             at = [p[a][here] + depth[here] * d[a][here] for a in range(3)]
-            light[:, here] = self._reflected(int(number), at, [c[:1].mean() for c in p], matt=True)
+            light[:, here] = self._reflected(int(number), at, o, matt=True)
         return light
 
 

@@ -16,7 +16,7 @@ from spikerig.rigctl.sim.solids import Box, Rect, Room, Sphere, Vec3
 from spikerig.rigctl.sim.world import World
 
 TEXELS = 256  # along the longest edge of any face
-CROWDED = 96  # along the edges of a crowd's sides at most
+CROWDED = 256  # along the edges of a crowd's sides at most
 MOST = 400_000  # texels of a crowd at most
 POINTS = 1 << 16  # of a crowd lit at once
 
@@ -140,7 +140,7 @@ def irradiance(world: World, p: Axes, n: Axes, crowds: Sequence[Crowd] = ()) -> 
             shut += _cover([p[a] - np.float32(centre[a]) for a in range(3)], n, size)
         if world.lamp.shadows:
             lit = np.flatnonzero(direct)
-            direct[lit] *= ~crowd.shadowed(world.lamp.position, [c[lit] for c in p])
+            direct[lit] *= ~crowd.shadowed(world.lamp.position, [np.asarray(c)[lit] for c in p])
     return direct, 1 - np.float32(world.contact) * np.minimum(shut, 1)
 
 
@@ -205,21 +205,35 @@ def light_map(world: World, face: Face, flip: bool, texel: float, crowds: Sequen
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CrowdMap:
-    """Irradiance of every side of every part of a crowd: [part, side, rows, columns] texels, read bilinearly."""
+    """Irradiance of every side of every part of a crowd: [part, side, rows, columns] texels, read bilinearly.
+
+    Args:
+        direct, open: the tables, flat.
+        shape, sides: of the parts; a ball's and a rod's round side close around it.
+        edge: rows, and columns, of a side.
+    """
 
     direct: Floats
     open: Floats
+    shape: str
     sides: int
     edge: int
 
     def at(self, part: Ints, side: Ints, s: Floats, t: Floats) -> tuple[Floats, Floats]:
         """`irradiance` at places 0 to 1 along the sides' u and v, float32[n] each."""
         top = np.float32(self.edge - 1.001)
-        x, y = (np.clip(c * np.float32(self.edge) - np.float32(0.5), 0, top) for c in (s, t))
-        i, j = x.astype(np.intp), y.astype(np.intp)
-        x, y = x - i, y - j
-        at = ((part * self.sides + side).astype(np.intp) * self.edge + j) * self.edge + i
-        corners = [at, at + 1, at + self.edge, at + (self.edge + 1)]
+        x, y = (c * np.float32(self.edge) - np.float32(0.5) for c in (s, t))
+        y = np.clip(y, 0, top)
+        if self.shape == "rect" or self.shape == "box":
+            x = np.clip(x, 0, top)
+        elif self.shape == "rod":
+            x = np.where(side % 3 == 0, x, np.clip(x, 0, top))
+        left, j = np.floor(x), y.astype(np.intp)
+        x, y, i = x - left, y - j, left.astype(np.intp) % self.edge
+        at = ((part * self.sides + side).astype(np.intp) * self.edge + j) * self.edge
+        right = at + (i + 1) % self.edge
+        at += i
+        corners = [at, right, at + self.edge, right + self.edge]
         return _bilinear(self.direct, corners, x, y), _bilinear(self.open, corners, x, y)
 
 
@@ -227,7 +241,8 @@ def crowd_map(world: World, crowd: Crowd, texel: float, crowds: Sequence[Crowd])
     """The table of a crowd, texels of about that size, at most MOST of them but no fewer than 2x2 a side."""
     parts = crowd.parts
     n, sides = len(parts), parts.sides
-    edge = int(min(np.ceil(2 * parts.half.max() / texel), np.sqrt(MOST / (n * sides)), CROWDED))
+    longest = parts.half.max() * (2 * np.pi if parts.shape in ("ball", "rod") else 2)
+    edge = int(min(np.ceil(longest / texel), np.sqrt(MOST / (n * sides)), CROWDED))
     edge = max(edge, 2)
     spots = (np.arange(2 * edge) + 0.5) / (2 * edge)
     s, t = (c.reshape(-1) for c in np.meshgrid(spots, spots))
@@ -238,7 +253,7 @@ def crowd_map(world: World, crowd: Crowd, texel: float, crowds: Sequence[Crowd])
             p, m = (list(c[k : k + step].reshape(-1, 3).T.astype(np.float32)) for c in (points, normals))
             for table, part in zip(tables, irradiance(world, p, m, crowds), strict=True):
                 table[k : k + step, side] = part.reshape(-1, edge, 2, edge, 2).mean((2, 4), dtype=np.float32)
-    return CrowdMap(tables[0].reshape(-1), tables[1].reshape(-1), sides, edge)
+    return CrowdMap(tables[0].reshape(-1), tables[1].reshape(-1), parts.shape, sides, edge)
 
 
 def _shadowed(solid: Sphere | Box, away: Axes, to: Axes, r2: Floats) -> NDArray[np.bool_]:

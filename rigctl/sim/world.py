@@ -171,5 +171,5 @@ def stands_in(world: World, at: NDArray[np.float64]) -> str:
         for parts in parts_of(solid):
             if holds(parts, at).any():
                 name = next(name for name, kind in KINDS.items() if isinstance(solid, kind))
-                return f"inside world.solids[{k}], a {name}"
+                return f"inside world.solids[{k}], a{'n' if name[0] in 'aeiou' else ''} {name}"
     return ""
