@@ -94,6 +94,6 @@ def capture(
 def provenance(spec: SceneSpec) -> dict[str, Any]:
     """How a scene was made, JSON-ready: the whole scene file as it was understood."""
     parts = {f.name: getattr(spec, f.name) for f in fields(spec) if f.name not in ("effects", "name", "seed")}
-    tables = {key: asdict(value) for key, value in parts.items()}
+    tables = {key: asdict(value) for key, value in parts.items() if value is not None}
     effects = {effect.name: parameters(effect) for effect in spec.effects}
     return {"made_by": "spikerig sim capture", "scene_file": {**tables, "effects": effects}}

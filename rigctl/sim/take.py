@@ -21,8 +21,9 @@ from spikerig.dataset.kernels import count
 from spikerig.dataset.scene import Camera, Frame, Points, Pose, Trajectory, Truth, View
 from spikerig.rigctl.sim.draws import stream
 from spikerig.rigctl.sim.effects import Effect, parameters
+from spikerig.rigctl.sim.rgb import encode
 from spikerig.rigctl.sim.schedule import Schedule, Track, phase_ns, start_ns
-from spikerig.rigctl.sim.sensor import Light, encode
+from spikerig.rigctl.sim.sensor import Light
 from spikerig.rigctl.sim.simulate import simulate
 from spikerig.rigctl.sim.spec import Cloud, Exposure, Sensor
 
@@ -92,20 +93,23 @@ def take_blurry(
     sharp: NDArray[np.float32],
     track: Track,
     rgb: NDArray[np.float32],
+    arm: NDArray[np.float32] | None = None,
 ) -> Taken:
     """A view for training: spikes over exposure and margins, and the blurry picture.
 
     Args:
         rig, number, name, plan, sharp, track: as for `take_sharp`.
         rgb: linear light float32[K,H,W,3] at `plan.phases`.
+        arm: the same as the RGB arm sees it, where that differs.
     """
     exposure = rig.exposure
     view, at_ns, path = _labelled(rig, number, name, plan, track, "train")
     first = int(plan.knots[0])
     t0_ns = start_ns(exposure, number) + round(first * exposure.tick_ns)
-    light = Light(rgb, plan.knots - first, (-first, exposure.ticks - first), exposure.rate_hz, t0_ns)
-    seen = simulate(light, rig.sensor, rig.effects, rig.seed, number)
-    error = seen.frame.pixels.astype(np.float64) - encode(sharp)
+    light = Light(rgb, plan.knots - first, (-first, exposure.ticks - first), exposure.rate_hz, t0_ns, arm)
+    seen = simulate(light, rig.sensor, rig.effects, rig.seed, number, rig.camera)
+    full = 255 / np.iinfo(seen.frame.pixels.dtype).max
+    error = seen.frame.pixels * full - encode(sharp)
     counts = count(seen.spikes.bits, rig.camera.width, -first, exposure.ticks - first)
     blur_db = 20 * np.log10(255 / max(float(np.sqrt(np.mean(error**2))), 1e-9))
     view = replace(view, frame=seen.frame, spikes=seen.spikes, trajectory=path)
