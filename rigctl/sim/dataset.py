@@ -70,7 +70,8 @@ def spec_of(order: Order, name: str) -> SceneSpec:
         path = (spec.shake.path_px[0] * scale, spec.shake.path_px[1] * scale)
         spec = replace(spec, lens=replace(spec.lens, width=width, height=height))
         spec = replace(spec, shake=replace(spec.shake, path_px=path))
-    return with_changes(spec, seed=order.seed, views=order.views or spec.orbit.views)
+    views = spec.orbit.views if order.views is None else order.views
+    return with_changes(spec, seed=order.seed, views=views)
 
 
 def make(

@@ -160,7 +160,8 @@ class Cluster:
             return future
 
         try:
-            queue = as_completed([future for _ in range(ahead) if (future := start()) is not None])
+            first = [future for _ in range(ahead) if (future := start()) is not None]
+            queue = as_completed(first, loop=self._client.loop)
             for future in queue:
                 write_whole(shelf.path(running.pop(future)), future.result())
                 future.release()
