@@ -262,7 +262,17 @@ def _npz(**arrays: Any) -> bytes:
     return file.getvalue()
 
 
-def test_foreign_views_are_refused() -> None:
+class Evil:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Path.touch, (self.path,))
+
+
+def test_foreign_views_are_refused(tmp_path: Path) -> None:
     good = dumps(take_view(small(), 0))
 
     def tree(value: Any) -> bytes:
@@ -272,7 +282,7 @@ def test_foreign_views_are_refused() -> None:
         b"",
         good[:200],
         good[: len(good) // 2],
-        _npz(tree=np.array([print], dtype=object)),  # a pickle, which nobody opens
+        _npz(tree=np.array([Evil(tmp_path / "opened")], dtype=object)),
         _npz(a0=np.zeros(3)),
         tree({"record": "os.system"}),
         tree({"record": "Pose", "cam_from_world": {"array": "a0"}}),
@@ -281,6 +291,7 @@ def test_foreign_views_are_refused() -> None:
     ):
         with pytest.raises(DataError, match="damaged"):
             loads(data, "x.npz")
+    assert not (tmp_path / "opened").exists()
 
 
 def test_a_shelf_keeps_to_its_settings(tmp_path: Path) -> None:

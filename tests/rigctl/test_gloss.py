@@ -13,7 +13,7 @@ from spikerig.rigctl.sim.grow import parts_of
 from spikerig.rigctl.sim.light import Stage
 from spikerig.rigctl.sim.orbit import Orbit, orbit_pose
 from spikerig.rigctl.sim.pattern import DIVES, SIDES, Texture, albedo, lattice
-from spikerig.rigctl.sim.shade import irradiance
+from spikerig.rigctl.sim.shade import CrowdMap, irradiance
 from spikerig.rigctl.sim.solids import Cylinder, Ellipsoid, Rect, Room, Scatter, Solid, Sphere
 from spikerig.rigctl.sim.world import Lamp, World
 
@@ -244,6 +244,20 @@ def test_cloth_is_woven() -> None:
 
 def test_round_things_have_no_seam() -> None:
     """Light on a ball and a rod goes on around the back, where their coordinates begin and end."""
+    table = np.random.default_rng(0).random(2 * 3 * 8 * 8, dtype=np.float32)
+    ends, height = np.array([1e-6, 1 - 1e-6], np.float32), np.full(2, 0.3, np.float32)
+    for shape, sides, side, closes in (
+        ("ball", 1, 0, True),
+        ("rod", 3, 0, True),
+        ("rod", 3, 1, False),
+        ("box", 6, 0, False),
+    ):
+        part, number = np.zeros(2, np.int32), np.full(2, side, np.int32)
+        light = CrowdMap(table, table, shape, sides, 8)
+        first, last = light.at(part, number, ends, height)[0]
+        beside = light.at(part, number, np.array([0.5, 7.5], np.float32) / 8, height)[0]
+        assert (abs(first - last) < 1e-4) == closes, shape
+        assert (abs(first - beside.mean()) < 1e-4) == closes, shape
     for solid in (Ellipsoid((0, 0, 0), (0.5, 0.5, 0.5), 0.0, WHITE), Cylinder((0, 0, -0.5), (0, 0, 0.5), 0.5, WHITE)):
         world = World((solid,), Lamp((-3, 3, 0.2), (10, 10, 10)), (0.1, 0.1, 0.1), 0.0, (0, 0, 0))
         pose = orbit_pose(Orbit(views=1, start_deg=180, radius=2.5, height=0.0), 0)
