@@ -109,7 +109,7 @@ def capture(
                 shelf.clear()
             raise
         # What lies in the way of the writer is what a kill left of this same scene.
-        told = pack(path, rig_of(spec), finished(spec, shelf), info=provenance(spec), force=True)
+        told = pack(path, rig_of(spec), finished(spec, shelf), info=provenance(spec), views=views, force=True)
         shelf.clear()
     return told
 

@@ -263,7 +263,7 @@ def _seal(folder: Path, spec: SceneSpec, shelf: Shelf) -> dict[str, Any]:
     """Gather the finished views of a scene in its file, beside it a contact sheet; its row of the manifest."""
     path = folder / f"{spec.name}.h5"
     info = {**provenance(spec), "made_by": "spikerig sim dataset"}
-    told = pack(path, rig_of(spec), finished(spec, shelf), info=info, force=True)
+    told = pack(path, rig_of(spec), finished(spec, shelf), info=info, views=spec.orbit.views, force=True)
     sheet = folder / f"{spec.name}.png"
     contact_sheet(sheet, path)
     keys = ("train_views", "test_views", "size", "ticks", "spikes_mean", "spikes_max", "blurry_psnr_db", "points")
