@@ -232,7 +232,7 @@ def test_a_child_that_dies_or_is_too_slow(tmp_path: Path, monkeypatch: pytest.Mo
     with pytest.raises(HostError, match="too long"):
         render_folder(plan, tmp_path / "slow", patience_s=0.001)
     with pytest.raises(HostError, match="died"):
-        render_folder(plan, tmp_path / "small", memory_gb=0.2)
+        render_folder(plan, tmp_path / "small", memory_gb=0.05)
     abort = tmp_path / "python"
     abort.write_text("#!/bin/sh\necho 'LLVM ERROR: Cannot select: fminimum' >&2\nkill -ABRT $$\n")
     abort.chmod(0o755)
