@@ -113,5 +113,5 @@ def capture_folder(
 
     info = {"made_by": "spikerig sim frames", "folder": folder.rig.name, "bad_values": folder.bad_values}
     points = read_points(folder.points) if folder.points else None
-    made = pack(path, folder.rig, good(), info=info, points=points, force=force, done=done)
+    made = pack(path, folder.rig, good(), info=info, points=points, views=len(folder.views), force=force, done=done)
     return made | {"bad_values": as_report(folder.bad_values, bad)}
