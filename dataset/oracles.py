@@ -141,6 +141,7 @@ def events(
             level[one] = b[one]
         last = now
     found = np.concatenate([np.zeros((0, 4)), *rows])
+    found = found[np.rint(found[:, 0]) < end]
     found = found[np.lexsort((found[:, 2], found[:, 1], found[:, 0]))]
     t, y, x, polarity = np.rint(found).astype(np.int64).T
     return t, x.astype(np.uint16), y.astype(np.uint16), polarity.astype(np.int8)
