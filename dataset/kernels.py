@@ -15,6 +15,7 @@ from spikerig.dataset.errors import NumericsError, UsageError
 Bits = NDArray[np.uint8]
 Noise = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int8]]  # pixel y*W+x, time in ns, polarity
 MAX_LIGHT = float(2**18)  # thresholds a tick: fixed-point light stays exact in a float64
+MAX_CHARGE = 2**62  # 2^-32 of a threshold
 
 
 def unpack(bits: Bits, width: int) -> NDArray[np.uint8]:
@@ -126,8 +127,8 @@ def tfi_all(bits: Bits, width: int) -> NDArray[np.uint16]:
 
 
 def fire(
-    light: NDArray[np.float32], knots: NDArray[np.int64], charge: NDArray[np.uint32], *, hold: bool
-) -> tuple[Bits, NDArray[np.uint32], NDArray[np.float64]]:
+    light: NDArray[np.float32], knots: NDArray[np.int64], charge: NDArray, *, hold: bool, carry: bool = False
+) -> tuple[Bits, NDArray, NDArray[np.float64]]:
     """Integrate light and fire a spike at every threshold.
 
     Args:
@@ -135,28 +136,46 @@ def fire(
         knots: int64, ticks, strictly increasing. Ramps (hold=False): K knots, light linear between them and taken at
             the middle of each tick. Steps (hold=True): light[k] holds for ticks [knots[k], knots[k+1]), with K + 1
             knots (or K: then the last light row is not used).
-        charge: uint32[H,W] at the start, in 2^-32 of a threshold; left as it is.
+        charge: uint32[H,W] at the start, in 2^-32 of a threshold; with `carry` also int64. It is left as it is.
         hold: steps instead of ramps.
+        carry: what a tick brings beyond one spike waits, and fires in the ticks after.
 
     Returns:
-        (bits uint8[T,H,ceil(W/8)], charge uint32[H,W] at the end, clipped float64[H,W] in thresholds), with
-        T = knots[-1] - knots[0].
+        (bits uint8[T,H,ceil(W/8)], charge at the end: uint32[H,W], with `carry` int64[H,W], whole thresholds above the
+        low 32 bits; clipped float64[H,W] in thresholds), with T = knots[-1] - knots[0].
 
     Raises:
         NumericsError: light is negative, not finite, or above 2^18 thresholds a tick.
         UsageError: shapes or knots that do not fit.
 
     Edges:
-        Light of one threshold a tick or more fires every tick; what is above one is clipped and counted. The sum of
-        light = spikes + (charge after - charge before)/2^32 + clipped, exactly in units of 2^-32 (clipped to 2^53
-        units). T = 0 gives no bits and the charge unchanged.
+        Light of one threshold a tick or more fires every tick; what is above one is clipped and counted, or with
+        `carry` kept (2^30 - 1 whole thresholds at most, then it is clipped too). The sum of light = spikes + (charge
+        after - charge before)/2^32 + clipped, exactly in units of 2^-32 (clipped to 2^53 units). T = 0 gives no bits
+        and the charge unchanged.
 
     Cost:
-        About half an operation a pixel and tick with AVX-512 below one threshold a tick, some ten times that above.
+        About half an operation a pixel and tick with AVX-512 below one threshold a tick, some three times that for 64
+        neighbours of which one is brighter.
 
     Source:
         Integrate-and-fire with the surplus kept, Eq. 5-6 of the paper; definition in `oracles.fire`.
     """
+    light, knots = checked_light(light, knots, charge, hold=hold)
+    if charge.dtype != np.uint32 and not (carry and charge.dtype == np.int64):
+        raise UsageError("charge is uint32, in 2^-32 of a threshold (with `carry` also int64)", value=charge.dtype)
+    left = checked_charge(charge, low=0)
+    height, width = light.shape[1:]
+    bits = np.empty((int(knots[-1] - knots[0]), height, (width + 7) // 8), np.uint8)
+    clipped = np.empty((height, width), np.float64)
+    _native.fire(light, knots, hold, carry, left, bits, clipped)
+    return bits, left if carry else left.astype(np.uint32), clipped
+
+
+def checked_light(
+    light: NDArray[np.float32], knots: NDArray[np.int64], charge: NDArray, *, hold: bool
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Light and knots as the native side takes them, or the faults that `fire` lists."""
     light = np.ascontiguousarray(light, np.float32)
     knots = np.ascontiguousarray(knots, np.int64)
     if light.ndim != 3 or knots.ndim != 1 or charge.shape != light.shape[1:] or light.shape[2] < 1:
@@ -179,14 +198,19 @@ def fire(
                 expected=f"0 .. {MAX_LIGHT:.0f}",
                 cause="a division by zero, or light in other units than thresholds a tick",
             )
-    if charge.dtype != np.uint32:
-        raise UsageError("charge is uint32, in 2^-32 of a threshold", value=charge.dtype)
-    height, width = light.shape[1:]
-    left = np.array(charge, np.uint32, order="C")
-    bits = np.empty((int(knots[-1] - knots[0]), height, (width + 7) // 8), np.uint8)
-    clipped = np.empty((height, width), np.float64)
-    _native.fire(light, knots, hold, left, bits, clipped)
-    return bits, left, clipped
+    return light, knots
+
+
+def checked_charge(charge: NDArray, *, low: int) -> NDArray[np.int64]:
+    """A copy of the charge as int64, within `low` .. 2^62 - 1."""
+    left = np.array(charge, np.int64, order="C")
+    if left.size and not (int(left.min()) >= low and int(left.max()) < MAX_CHARGE):
+        raise NumericsError(
+            "charge is out of range",
+            value=f"between {int(left.min())} and {int(left.max())} in 2^-32 of a threshold",
+            expected=f"{low} .. 2^62 - 1",
+        )
+    return left
 
 
 def events(

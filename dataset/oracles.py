@@ -55,7 +55,8 @@ def fixed_light(light: NDArray[np.float32], knots: NDArray[np.int64], *, hold: b
     """The light of every tick in units of 2^-32 threshold, as `fire` integrates it: int64[T,H,W].
 
     A ramp from a to b over n ticks, both rounded to units, gives tick j floor(a + D/2 + j D) with D = (b - a)/n; D and
-    D/2 are rounded to 2^-32 of a unit, so that the light of a million ticks is right to a quarter of a unit.
+    D/2 are rounded up to 2^-32 of a unit, so that the light of a million ticks is right to a quarter of a unit and no
+    ramp falls below zero.
     """
     unit = 2.0**32
     rows = [np.zeros((0, *light.shape[1:]), np.int64)]
@@ -73,23 +74,41 @@ def fixed_light(light: NDArray[np.float32], knots: NDArray[np.int64], *, hold: b
 
 def _parts(x: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     whole = np.rint(x)
-    return whole.astype(np.int64), np.rint((x - whole) * 2.0**32).astype(np.int64)
+    return whole.astype(np.int64), np.ceil((x - whole) * 2.0**32).astype(np.int64)
 
 
 def fire(
-    light: NDArray[np.float32], knots: NDArray[np.int64], charge: NDArray[np.uint32], *, hold: bool
-) -> tuple[Bits, NDArray[np.uint32], NDArray[np.float64]]:
+    light: NDArray[np.float32], knots: NDArray[np.int64], charge: NDArray, *, hold: bool, carry: bool = False
+) -> tuple[Bits, NDArray, NDArray[np.float64]]:
     """Integrate and fire, in closed form: spikes so far = floor of the charge so far, in thresholds.
 
-    Every tick adds at most one threshold; what light is above that is clipped.
+    Every tick adds at most one threshold; what light is above that is clipped. With `carry` every tick adds all of
+    its light, and whole thresholds wait for the ticks after: a tick at a time, at most 2^30 - 1 of them.
     """
     every = fixed_light(light, knots, hold=hold)
+    if carry:
+        return _carried(every, charge)
     taken = np.minimum(every, 2**32)
     total = charge.astype(np.int64) + np.concatenate([np.zeros_like(taken[:1]), taken]).cumsum(0)[: len(taken) + 1]
     fired = np.diff(total >> 32, axis=0)
-    excess = every - taken
-    clipped = (excess >> 26).sum(0).astype(object) * 2**26 + (excess & (2**26 - 1)).sum(0)  # beyond 64 bits
-    return pack(fired), (total[-1] & 0xFFFFFFFF).astype(np.uint32), (clipped / 2**32).astype(np.float64)
+    clipped = _sum(every - taken) / 2**32
+    return pack(fired), (total[-1] & 0xFFFFFFFF).astype(np.uint32), clipped.astype(np.float64)
+
+
+def _carried(every: NDArray[np.int64], charge: NDArray) -> tuple[Bits, NDArray[np.int64], NDArray[np.float64]]:
+    total, fired, lost = charge.astype(np.int64), np.zeros(every.shape, bool), np.zeros_like(every)
+    for t, light in enumerate(every):
+        total = total + light
+        lost[t] = np.maximum((total >> 32) - (2**30 - 1), 0) << 32
+        total = total - lost[t]
+        fired[t] = total >= 2**32
+        total = total - (fired[t].astype(np.int64) << 32)
+    return pack(fired), total, (_sum(lost) / 2**32).astype(np.float64)
+
+
+def _sum(x: NDArray[np.int64]) -> NDArray:
+    """Over ticks, beyond 64 bits: Python's integers."""
+    return (x >> 26).sum(0).astype(object) * 2**26 + (x & (2**26 - 1)).sum(0)
 
 
 def events(

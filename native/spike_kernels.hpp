@@ -54,13 +54,24 @@ struct Light {
   bool hold;               // rows[k] over segment k; else linear from rows[k] to rows[k + 1]
 };
 
+// Noise of fire_noisy(), in dataset/sim_oracles.py.
+struct Noise {
+  const float *electrons;      // [height, width] electrons that make a threshold; null: no shot noise
+  uint32_t shot_key[2];
+  float sd;                    // of the comparator, thresholds; 0: no noise
+  uint32_t comparator_key[2];
+  uint32_t loss;               // share of a tick's light lost after a spike, in 2^-32
+};
+
 #define SPIKERIG_DECLARE_SPIKE_KERNELS(isa)                                                                     \
   namespace isa {                                                                                               \
   void unpack(const Packed &s, uint8_t *out);                                                                   \
   void count(const Packed &s, int64_t t0, int64_t t1, uint32_t *out);                                           \
   void tfi_at(const Packed &s, int64_t tick, int before, int after, int32_t *previous, int32_t *next);          \
   void tfi_all(const Packed &s, uint16_t *out);                                                                 \
-  void fire(const Light &light, uint32_t *charge, uint8_t *bits, double *clipped);                              \
+  void fire(const Light &light, bool carry, int64_t *charge, uint8_t *bits, double *clipped);                   \
+  void fire_noisy(const Light &light, int64_t first_tick, const Noise &noise, bool carry, int64_t *charge,      \
+                  const uint8_t *before, uint8_t *bits, double *lost);                                          \
   }
 SPIKERIG_EACH_ISA(SPIKERIG_DECLARE_SPIKE_KERNELS)
 

@@ -88,7 +88,7 @@ def capture(
         UsageError: the file exists. HostError: the disk is full or a worker died.
     """
     takes = in_parallel(take_view, spec, spec.orbit.views, workers)
-    return pack(path, rig_of(spec), takes, info=provenance(spec), force=force, done=done)
+    return pack(path, rig_of(spec), takes, info=provenance(spec), views=spec.orbit.views, force=force, done=done)
 
 
 def provenance(spec: SceneSpec) -> dict[str, Any]:

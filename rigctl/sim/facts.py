@@ -12,14 +12,22 @@ from spikerig.dataset.images import srgb_from_linear
 
 Floats = NDArray[np.floating]
 PART = 95.0  # a bound holds for this share of the pixels, percent
+SLACK = 1.25  # bounds take changes of charge this much larger than computed: a survey is a sample
+DRAWS = 8192  # of a noise, at least, where a bound needs its distribution
 
 
 @dataclass(frozen=True, slots=True)
 class Bound:
     """How much an effect can change the two outputs, in 95 % of the pixels.
 
+    Counts are whole, and the phases of pixels are as good as even, so a change of charge by c thresholds changes a
+    count by floor(c) or ceil(c), by the latter with chance c - floor(c): a tenth of a threshold changes one count in
+    ten by one, and the 95th percentile of the change is 1, not 0.1. Charge gained before the exposure begins counts
+    too: it moves the spike that falls in first. See `Facts.counted`.
+
     Args:
-        spikes: change of the spike count of one exposure.
+        spikes: change of the spike count of one exposure: whole from 1 on; below 1 the 95th percentile is no change
+            at all, and the number is the share of pixels that change, over 5 %, so that small bounds may be summed.
         dn: change of an RGB value, digital numbers of 255.
         formula: where it comes from, with this scene's numbers.
     """
@@ -96,13 +104,51 @@ class Facts:
         values = np.asarray(values, np.float64)
         return float(np.percentile(np.abs(values), PART)) if values.size else 0.0
 
-    def spikes(self, change: Floats | Callable[[Floats], Floats]) -> float:
-        """Change of the spike count when the light changes: by an amount [n] in thresholds a tick, or to a function's.
+    def spikes(self, change: Floats | Callable[[Floats], Floats], share: float = 1.0) -> float:
+        """Change of the spike count when the light changes: by an amount [..,n] in thresholds a tick, or a function's.
 
         The count of a steady pixel moves by the light times the ticks, and not beyond one spike a tick.
         """
         after = change(self.light) if callable(change) else self.light + np.asarray(change)
-        return self.most((np.clip(after, 0, 1) - self.rate) * self.ticks)
+        moved = np.clip(after, 0, 1) - self.rate
+        return self.counted(moved * self.ticks, moved * self.margin_ticks, share)
+
+    def counted(self, change: Floats, before: Floats | float = 0.0, share: float = 1.0) -> float:
+        """Change of the spike count that 95 % of the pixels stay within, as `Bound.spikes` says.
+
+        Args:
+            change: of the charge over the exposure, thresholds [..,n].
+            before: of the charge until the exposure begins, thresholds [..,n].
+            share: of the pixels (or views) that change at all.
+
+        Edges:
+            The count is floor(phase + charge) at the end less the same at the start, both phases even and independent:
+            exact where the counts of a picture spread over a few spikes, which a picture's do.
+        """
+        start = SLACK * np.asarray(before, np.float64)
+        end = start + SLACK * np.asarray(change, np.float64)
+        start, end = (a.reshape(-1) for a in np.broadcast_arrays(start, end))
+        if not start.size:
+            return 0.0
+        whole = (np.floor(end) - np.floor(start)).astype(np.int64)
+        more, less = end - np.floor(end), start - np.floor(start)
+        tally = np.zeros(int(np.abs(whole).max()) + 2)
+        for step, chance in (
+            (-1, (1 - more) * less),
+            (0, more * less + (1 - more) * (1 - less)),
+            (1, more * (1 - less)),
+        ):
+            found = np.bincount(np.abs(whole + step), chance)
+            tally[: len(found)] += found
+        beyond = share * (1 - np.cumsum(tally) / start.size)
+        rare = 1 - PART / 100
+        least = int(np.argmax(beyond <= rare))  # the last is 0 but for rounding
+        return float(least) if least else max(float(beyond[0]), 0.0) / rare
+
+    def normal(self, kinds: int = 1) -> Floats:
+        """Fixed draws of independent unit normals to compute with, float64[kinds,m,n], m * n at least `DRAWS`."""
+        n = max(1, self.light.size)
+        return np.random.default_rng(95).standard_normal((kinds, -(-DRAWS // n), n))
 
     def dn(self, change: Floats | Callable[[Floats], Floats]) -> float:
         """Change of an RGB value when linear light changes: by an amount [n,3] either way, or to a function's."""

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from spikerig.dataset.errors import UsageError
+from spikerig.dataset.errors import RigError, UsageError
 from spikerig.rigctl.sim.effects import Effect, effect_class, in_order, read_effects
 from spikerig.rigctl.sim.limits import Faults, limits, nearest, read_record
 from spikerig.rigctl.sim.orbit import Orbit, orbit_pose
@@ -93,11 +93,13 @@ class Sensor:
 
     Args:
         preset: a published spike camera: its effects become those to choose from, its settings the defaults.
+        map: with `vidar-map`, the sensor's own maps (.npz; see effect `sensor_map`); its path from the scene file.
         gain: spikes a tick at RGB white (1 / threshold in the paper's units); 0.4, or 0.5 for `paper`.
         response: of the spike camera to linear red, green and blue.
     """
 
     preset: str = limits("", choices=preset_names("spike"))
+    map: str = limits("", unit="a .npz file")
     gain: float = limits(0.4, 1e-9, 1e9, "spikes a tick at white")
     response: Vec3 = limits((0.299, 0.587, 0.114), 0, 100)
 
@@ -241,7 +243,9 @@ def _settings(top: _Top, faults: Faults) -> Settings:
     rgb = read_record(RgbCamera, top.rgb, "rgb", faults)
     cloud = read_record(Cloud, top.points, "points", faults)
     tolerance = read_record(Tolerance, top.tolerance, "tolerance", faults)
-    effects = _effects(top, preset_effects(sensor.preset, rgb.preset), exposure.phase, faults)
+    effects = _effects(top, preset_effects(sensor.preset, rgb.preset, map=sensor.map), exposure.phase, faults)
+    if (sensor.preset == "vidar-map") != bool(sensor.map):
+        faults.add("sensor.map", f"is '{sensor.map}', preset '{sensor.preset}': a map and preset vidar-map go together")
     _check_exposure(exposure, faults)
     if sum(sensor.response) <= 0:
         faults.add("sensor.response", "is all zero: the spike camera would be blind")
@@ -270,6 +274,14 @@ def _effects(top: _Top, presets: list[Mapping[str, Any]], phase: str, faults: Fa
         faults.add("effects", "list initial_phase, but exposure.phase is zero: these contradict each other")
     if phase == "random" and "initial_phase" not in found:
         found["initial_phase"] = effect_class("initial_phase")()
+    for name, effect in found.items():
+        for other in set(getattr(effect, "excludes", ())) & set(found):
+            faults.add("effects", f"list {name} and {other}: the same thing would count twice")
+        if hasattr(effect, "placed"):
+            try:
+                found[name] = effect.placed(Path(faults.source).parent)
+            except RigError as error:
+                faults.add(f"effects.{name}", f"{error.what}: {error.value}")
     return in_order(found.values())
 
 

@@ -130,6 +130,9 @@ class Effect(Protocol):
     """What every effect class offers, beside its parameters as dataclass fields.
 
     `per` says what `cost_ns` counts: nanoseconds a pixel and "tick", "knot" (a light sample), or "frame" (a picture).
+
+    Two more are optional: `excludes`, names of effects that would count the same thing twice, and `placed(folder)`, the
+    effect with its file found from the folder of the scene file (or a RigError).
     """
 
     name: str
@@ -152,9 +155,25 @@ class Effect(Protocol):
 # Effects of one stage act in the order of the table.
 EFFECTS: Mapping[str, tuple[str, str]] = {
     "shot_noise": ("shot", "ShotNoise"),
+    "prnu": ("prnu", "Prnu"),
+    "sensor_map": ("maps", "SensorMap"),
     "dark_current": ("dark", "DarkCurrent"),
     "threshold_fpn": ("fpn", "ThresholdFpn"),
+    "reset_loss": ("reset", "ResetLoss"),
+    "comparator_noise": ("comparator", "ComparatorNoise"),
     "initial_phase": ("phase", "InitialPhase"),
+    "saturation": ("saturation", "Saturation"),
+    "hot_pixels": ("hot", "HotPixels"),
+    "stuck_pixels": ("stuck", "StuckPixels"),
+    "row_noise": ("rownoise", "RowNoise"),
+    "bit_flips": ("flips", "BitFlips"),
+    "lost_blocks": ("blocks", "LostBlocks"),
+    "wide_rows": ("rows", "WideRows"),
+    "clock_offset": ("clock", "ClockOffset"),
+    "clock_skew": ("clock", "ClockSkew"),
+    "clock_wander": ("clock", "ClockWander"),
+    "clock_jitter": ("clock", "ClockJitter"),
+    "clock_reset": ("clock", "ClockReset"),
     "read_noise": ("read", "ReadNoise"),
 }
 

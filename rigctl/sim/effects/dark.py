@@ -44,6 +44,6 @@ class DarkCurrent:
         return Hooks(light=light)
 
     def magnitude(self, facts: Facts) -> Bound:
-        """(rate + 3 sd) ticks."""
-        spikes = (self.rate + 3 * self.sd) * facts.ticks
-        return Bound(spikes, 0.0, f"({self.rate:g} + 3 x {self.sd:g}) x {facts.ticks}")
+        """(rate + sd z) ticks, z normal; no more than fit below one spike a tick."""
+        dark = np.maximum(self.rate + self.sd * facts.normal()[0], 0)
+        return Bound(facts.spikes(dark), 0.0, f"({self.rate:g} + {self.sd:g} z) x {facts.ticks}")

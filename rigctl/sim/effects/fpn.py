@@ -40,6 +40,7 @@ class ThresholdFpn:
         return Hooks(light=light)
 
     def magnitude(self, facts: Facts) -> Bound:
-        """Three standard deviations of the count: 3 sd light ticks."""
+        """sd z of the count, z normal."""
+        threshold = np.maximum(1 + self.sd * facts.normal()[0], 0.1)
         counts = facts.most(facts.counts)
-        return Bound(3 * self.sd * counts, 0.0, f"3 x {self.sd:g} x {counts:.3g} spikes")
+        return Bound(facts.spikes(lambda light: light / threshold), 0.0, f"{self.sd:g} z x {counts:.3g} spikes")

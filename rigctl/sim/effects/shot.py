@@ -58,10 +58,12 @@ class ShotNoise:
         return Hooks(light=light, per_tick=True)
 
     def magnitude(self, facts: Facts) -> Bound:
-        """Three standard deviations of the count: 3 sqrt(light ticks / threshold_e)."""
+        """Charge of standard deviation sqrt(light ticks / threshold_e), in the exposure and in the margin before."""
+        sd = np.sqrt(facts.rate / self.threshold_e)
+        within, before = facts.normal(2) * sd * np.sqrt([[[facts.ticks]], [[facts.margin_ticks]]])
         rate = facts.most(facts.rate)
-        spikes = 3 * float(np.sqrt(rate * facts.ticks / self.threshold_e))
-        return Bound(spikes, 0.0, f"3 sqrt({rate:.3g} x {facts.ticks} / {self.threshold_e:g})")
+        told = f"z sqrt({rate:.3g} x {facts.ticks} / {self.threshold_e:g}), and of {facts.margin_ticks} ticks before"
+        return Bound(facts.counted(within, before), 0.0, told)
 
 
 def normal_cdf(z: NDArray[np.float64]) -> NDArray[np.float64]:
