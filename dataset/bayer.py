@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.clocktime import frozen_array
 from spikerig.dataset.errors import DataError, UsageError
-from spikerig.dataset.texture import Texture
+
+if TYPE_CHECKING:
+    from spikerig.dataset.texture import Texture
 
 PATTERNS = ("rggb", "grbg", "gbrg", "bggr")
 
@@ -55,6 +57,10 @@ class ColourTexture:
     def __post_init__(self) -> None:
         object.__setattr__(self, "light", frozen_array(self.light, np.float32))
         object.__setattr__(self, "known", frozen_array(self.known, np.bool_))
+
+    def with_nan(self) -> NDArray[np.float32]:
+        """The light, NaN where it is not known."""
+        return np.where(self.known, self.light, np.float32(np.nan))
 
 
 def bayer_of(info: Mapping[str, Any]) -> Bayer | None:

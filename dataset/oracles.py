@@ -133,7 +133,7 @@ def events(
     seen = light[0].astype(np.float64)
     level, free = np.log(seen + eps), np.full(seen.shape, -np.inf)
     held = np.zeros(seen.shape, bool)
-    rows: list[NDArray[np.float64]] = []
+    rows: list[NDArray] = []
 
     def fire(where: NDArray[np.bool_], at: float, polarity: int) -> None:
         y, x = np.nonzero(where)
