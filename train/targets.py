@@ -212,7 +212,7 @@ def _read(
 
     colour, tfs, ratio = instants
     view = scene.view(name, spikes=config.needs_spikes)
-    decode = np.arange(256) / 255.0
+    decode = np.arange(view.frame.full + 1) / view.frame.full
     if view.frame.transfer == "srgb":
         decode = linear_from_srgb(decode)
     light = np.asarray(decode, np.float32)[view.frame.pixels]
@@ -230,7 +230,7 @@ def _read(
     if config.needs_spikes:
         clock = scene.clock
         mean, known = exposure_mean(view, clock)
-        pairs.add(view.frame.pixels, light, mean, known & view.valid)
+        pairs.add(view.frame.pixels8, light, mean, known & view.valid)
         made["mean"], made["mean_known"] = mean, known
         for phase in dict.fromkeys((*tfs, *ratio)):
             tick = spike_tick(view, instant_ns(view.frame, phase), clock)

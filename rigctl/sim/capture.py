@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spikerig.dataset.scene import Camera
 from spikerig.rigctl.sim.draws import stream
@@ -54,14 +55,23 @@ def take_view(spec: SceneSpec, number: int, stage: Stage | None = None) -> Taken
     held_out = spec.orbit.held_out()
     if number in held_out:
         return take_sharp(rig, number, name, plan, sharp, track)
-    rgb = np.empty((len(plan.phases), *sharp.shape), np.float32)
-    for k, pose in enumerate(path.poses(plan.phases)):
+    poses = path.poses(plan.phases)
+    rgb = np.empty((len(poses), *sharp.shape), np.float32)
+    for k, pose in enumerate(poses):
         rgb[k] = sharp if plan.phases[k] == plan.label else stage.picture(rig.camera, pose, spec.lens.samples)
-    taken = take_blurry(rig, number, name, plan, sharp, track, rgb)
+    taken = take_blurry(rig, number, name, plan, sharp, track, rgb, rgb_arm(spec, stage, poses))
     train = [k for k in range(spec.orbit.views) if k not in held_out]
     share = share_of(spec.cloud.count, train.index(number), len(train))
     depth = stage.depth(rig.camera, label)
     return replace(taken, points=surface(rig, number, spec.cloud, share, taken.view, depth))
+
+
+def rgb_arm(spec: SceneSpec, stage: Stage, poses: NDArray[np.float64]) -> NDArray[np.float32] | None:
+    """What the RGB camera sees where it is misaligned: float32[K,H,W,3] while the spike camera is at `poses`."""
+    apart: Any = next((e for e in spec.effects if e.name == "misalignment"), None)
+    if apart is None or apart.absent:
+        return None
+    return np.stack([stage.picture(camera_of(spec), pose, spec.lens.samples) for pose in apart.rgb_poses(poses)])
 
 
 def capture(

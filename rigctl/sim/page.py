@@ -53,7 +53,10 @@ def page() -> str:
     for kind, record in KINDS.items():
         parts.append(f'### `[[world.solids]]`, `kind = "{kind}"`\n\n{_about(record)}{_rows(record)}')
     parts.append(f"### Textures: `texture`, `floor`, `ceiling`, `walls`\n\n{_about(Texture)}{_rows(Texture)}")
-    parts.append("## Effects\n\nThey act in this order. Each draws from its own random stream of (seed, name, view).\n")
+    parts.append(
+        "## Effects\n\nThey act in this order. Each draws from its own random stream of (seed, name, view).\n"
+        "Blur by motion is none of them: it is the exposure itself, `[exposure]` and `[shake]`.\n"
+    )
     for name in EFFECTS:
         effect: Any = effect_class(name)
         parts.append(

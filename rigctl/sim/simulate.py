@@ -26,21 +26,26 @@ if TYPE_CHECKING:
 class Simulated:
     """One view as the cameras saw it, and what only the simulator knows.
 
-    Args:
-        spikes: over all of the light's ticks.
-        frame: sRGB, 8 bits.
-        blurry: float64[H,W,3], the exposure's mean linear light before any response.
-        start: float64[H,W], charge before the first tick, thresholds.
-        left: uint32[H,W], charge after the last tick, 2^-32 thresholds.
-        clipped: float64[H,W], charge beyond one spike a tick, thresholds.
-        events: of the event camera, None without one.
+        Args:
+            spikes: over all of the light's ticks.
+            frame: sRGB, 8 bits.
+            blurry: float64[H,W,3], the exposure's mean linear light before any response.
+            start: float64[H,W], charge before the first tick, thresholds.
+    <<<<<<< HEAD
+            left: uint32[H,W], charge after the last tick, 2^-32 thresholds.
+            clipped: float64[H,W], charge beyond one spike a tick, thresholds.
+            events: of the event camera, None without one.
+    =======
+            left: uint32 or int64 [H,W], charge after the last tick, 2^-32 thresholds.
+            clipped: float64[H,W], charge beyond one spike a tick (or gone in a reset), thresholds.
+    >>>>>>> main
     """
 
     spikes: SpikeStream
     frame: Frame
     blurry: NDArray[np.float64]
     start: NDArray[np.float64]
-    left: NDArray[np.uint32]
+    left: NDArray[np.uint32] | NDArray[np.int64]
     clipped: NDArray[np.float64]
     events: EventStream | None = None
 
@@ -78,7 +83,8 @@ def simulate(
         raise UsageError("an effect is listed twice", value=", ".join(sorted(n for n in names if names.count(n) > 1)))
     height, width = light.rgb.shape[1:3]
     ticks = int(light.knots[-1] - light.knots[0])
-    site = Site(height, width, view, seed, light.rate_hz, light.t0_ns * 1e-9, ticks, camera)
+    own_arm = light.arm is not None
+    site = Site(height, width, view, seed, light.rate_hz, light.t0_ns * 1e-9, ticks, camera, own_arm)
     steps = [effect.begin(site) for effect in in_order(effects)]
     light = _lit(light, steps)
     spikes, start, left, clipped = _spikes(light, sensor, steps)
@@ -104,7 +110,7 @@ def _lit(light: Light, steps: Sequence[Hooks]) -> Light:
 
 def _spikes(
     light: Light, sensor: Sensor, steps: Sequence[Hooks]
-) -> tuple[SpikeStream, NDArray[np.float64], NDArray[np.uint32], NDArray[np.float64]]:
+) -> tuple[SpikeStream, NDArray[np.float64], NDArray[np.uint32] | NDArray[np.int64], NDArray[np.float64]]:
     """The spike arm: stream, charge before, charge left, charge clipped."""
     height, width = light.rgb.shape[1:3]
     seen, knots = delayed(_arrived(light, sensor, steps), light.knots, _ahead(light, [h.clock_ns for h in steps]))

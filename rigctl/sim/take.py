@@ -122,8 +122,7 @@ def take_blurry(
     t0_ns = start_ns(exposure, number) + round(first * exposure.tick_ns)
     light = Light(rgb, plan.knots - first, (-first, exposure.ticks - first), exposure.rate_hz, t0_ns, arm)
     seen = simulate(light, rig.sensor, rig.effects, rig.seed, number, rig.camera, rig.events)
-    full = 255 / np.iinfo(seen.frame.pixels.dtype).max
-    error = seen.frame.pixels * full - encode(sharp)
+    error = seen.frame.pixels * (255 / seen.frame.full) - encode(sharp)
     counts = count(seen.spikes.bits, rig.camera.width, -first, exposure.ticks - first)
     blur_db = 20 * np.log10(255 / max(float(np.sqrt(np.mean(error**2))), 1e-9))
     view = replace(view, frame=seen.frame, spikes=seen.spikes, trajectory=path)
@@ -162,7 +161,9 @@ def surface(rig: Rig, number: int, cloud: Cloud, share: int, view: View, depth: 
     y, x = np.divmod(picked, camera.width)
     K = camera.K
     rays = np.stack([(x + 0.5 - K[0, 2]) / K[0, 0], (y + 0.5 - K[1, 2]) / K[1, 1], np.ones(len(picked))], 1)
-    return Points((rays * z[:, None] - pose[:, 3]) @ pose[:, :3], view.frame.pixels.reshape(-1, 3)[picked], "simulator")
+    return Points(
+        (rays * z[:, None] - pose[:, 3]) @ pose[:, :3], view.frame.pixels8.reshape(-1, 3)[picked], "simulator"
+    )
 
 
 def share_of(total: int, rank: int, views: int) -> int:
@@ -255,7 +256,9 @@ def pack(
 
 
 def true_clock(rig: Rig, views: int) -> ClockModel:
-    """The exact map from the spike camera's time to the rig's: a knot at both ends of each view's spikes.
+    """The exact map from the spike camera's time to the rig's: knots over each view's spikes.
+
+    They lie at start, middle and end of each exposure and at the ends of its margins, straight in between.
 
     Raises:
         UsageError: the clock steps back from one view to the next.
@@ -264,16 +267,16 @@ def true_clock(rig: Rig, views: int) -> ClockModel:
     if not clocks or not views:
         return ClockModel.identity()
     exposure, margin = rig.exposure, rig.exposure.margin_ticks
-    ends = np.rint(np.array([-margin, exposure.ticks + margin]) * exposure.tick_ns).astype(np.int64)
-    at_ns = np.array([start_ns(exposure, number) + ends for number in range(views)])
+    ticks = np.unique([-margin, 0, exposure.ticks / 2, exposure.ticks, exposure.ticks + margin])
+    at_ns = np.array([start_ns(exposure, k) + np.rint(ticks * exposure.tick_ns) for k in range(views)]).astype(np.int64)
     ahead = np.zeros(at_ns.shape)
-    for number, both in enumerate(at_ns):
-        t0_s = float(both[0]) * 1e-9
+    for number, times in enumerate(at_ns):
+        t0_s = float(times[0]) * 1e-9
         site = Site(rig.camera.height, rig.camera.width, number, rig.seed, exposure.rate_hz, t0_s)
         for effect in clocks:
             clock = effect.begin(site).clock_ns
             if clock is not None:
-                ahead[number] += clock(both)
+                ahead[number] += clock(times)
     rig_ns = at_ns.reshape(-1)
     return ClockModel(rig_ns + np.rint(ahead.reshape(-1)).astype(np.int64), rig_ns, np.zeros(len(rig_ns)), 0.0)
 
