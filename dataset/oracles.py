@@ -133,7 +133,7 @@ def events(
     seen = light[0].astype(np.float64)
     level, free = np.log(seen + eps), np.full(seen.shape, -np.inf)
     held = np.zeros(seen.shape, bool)
-    rows: list[NDArray[np.float64]] = []
+    rows: list[NDArray] = []
 
     def fire(where: NDArray[np.bool_], at: float, polarity: int) -> None:
         y, x = np.nonzero(where)
@@ -160,6 +160,7 @@ def events(
             level[one] = b[one]
         last = now
     found = np.concatenate([np.zeros((0, 4)), *rows])
+    found = found[np.rint(found[:, 0]) < end]
     found = found[np.lexsort((found[:, 2], found[:, 1], found[:, 0]))]
     t, y, x, polarity = np.rint(found).astype(np.int64).T
     return t, x.astype(np.uint16), y.astype(np.uint16), polarity.astype(np.int8)

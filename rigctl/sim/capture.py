@@ -29,7 +29,7 @@ def camera_of(spec: SceneSpec) -> Camera:
 
 def rig_of(spec: SceneSpec) -> Rig:
     """The sensors of a scene."""
-    return Rig(spec.name, spec.seed, camera_of(spec), spec.exposure, spec.sensor, spec.effects)
+    return Rig(spec.name, spec.seed, camera_of(spec), spec.exposure, spec.sensor, spec.effects, spec.events)
 
 
 def view_path(spec: SceneSpec, number: int) -> ShakePath:

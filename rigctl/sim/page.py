@@ -8,6 +8,7 @@ import re
 from typing import Any
 
 from spikerig.rigctl.sim.effects import EFFECTS, effect_class
+from spikerig.rigctl.sim.events import EventCamera
 from spikerig.rigctl.sim.orbit import Orbit
 from spikerig.rigctl.sim.pattern import Texture
 from spikerig.rigctl.sim.spec import PAPER, Cloud, Exposure, Lens, RgbCamera, Sensor, Shake, Tolerance
@@ -20,6 +21,7 @@ TABLES: tuple[tuple[str, type], ...] = (
     ("exposure", Exposure),
     ("sensor", Sensor),
     ("rgb", RgbCamera),
+    ("events", EventCamera),
     ("tolerance", Tolerance),
     ("points", Cloud),
     ("world.lamp", Lamp),
