@@ -12,15 +12,14 @@ struct State {
   Draws draws;
 };
 
-using Step = decltype(&step<true, true, true, true, true>);
+using Step = decltype(&step<true, true, true, true>);
 
 // By shot, comparator and loss.
 Step step_for(const Noise &noise) {
   static const Step table[8] = {
-      step<true, true, false, false, false>, step<true, true, true, false, false>,
-      step<true, true, false, true, false>,  step<true, true, true, true, false>,
-      step<true, true, false, false, true>,  step<true, true, true, false, true>,
-      step<true, true, false, true, true>,   step<true, true, true, true, true>,
+      step<true, false, false, false>, step<true, true, false, false>, step<true, false, true, false>,
+      step<true, true, true, false>,   step<true, false, false, true>, step<true, true, false, true>,
+      step<true, false, true, true>,   step<true, true, true, true>,
   };
   return table[(noise.electrons ? 1 : 0) + (noise.sd > 0 ? 2 : 0) + (noise.loss ? 4 : 0)];
 }
@@ -65,7 +64,7 @@ void fire_noisy(const Light &light, int64_t first_tick, const Noise &noise, bool
       const int64_t since = light.knots[k] - light.knots[0];
       for (int64_t t = 0; t < ticks; t += TICKS) {
         const int64_t n = std::min(TICKS, ticks - t), first = first_tick + since + t;
-        s.draws.drawn = (first & 3) != 0 && s.draws.drawn && s.draws.quad == first >> 2;
+        s.charges.settle(n);
         for (int64_t i = 0; i < pixels; i += AT_ONCE * LANES)
           run(s.ramp, s.charges, &s.draws, &noise, carry ? INT32_MAX : 1, i, n, first,
               bits + (since + t) * frame + at.begin + i / 8, frame, at.bytes() - i / 8);
@@ -77,7 +76,7 @@ void fire_noisy(const Light &light, int64_t first_tick, const Noise &noise, bool
       for (int64_t j = 0; j < n; ++j) {
         charge[pixel + j] = static_cast<int64_t>(static_cast<uint64_t>(s.charges.whole[i + j]) << 32 |
                                                  s.charges.word[i + j]);
-        lost[pixel + j] = static_cast<double>(s.charges.lost[i + j]) / UNIT;
+        lost[pixel + j] = s.charges.lost_of(i + j);
       }
     });
   });
