@@ -109,3 +109,65 @@ def _carried(every: NDArray[np.int64], charge: NDArray) -> tuple[Bits, NDArray[n
 def _sum(x: NDArray[np.int64]) -> NDArray:
     """Over ticks, beyond 64 bits: Python's integers."""
     return (x >> 26).sum(0).astype(object) * 2**26 + (x & (2**26 - 1)).sum(0)
+
+
+def events(
+    light: NDArray[np.float32],
+    at_ns: NDArray[np.float64],
+    thresholds: tuple[NDArray[np.float64], NDArray[np.float64]],
+    *,
+    hold: bool,
+    eps: float,
+    refractory_ns: int = 0,
+    tau_ns: float = 0.0,
+    noise: tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int8]] | None = None,
+    step_ns: float = 10.0,
+) -> tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.uint16], NDArray[np.int8]]:
+    """An event camera looked at every `step_ns`: the same events, up to a step late.
+
+    A pixel compares b = log(light + eps) with its reference: at b >= reference + up an event of +1 and the reference
+    rises by `up`, likewise down; with a refractory time the pixel is held and its reference is b at the end of it.
+    """
+    up, down = (np.broadcast_to(t, light.shape[1:]) for t in thresholds)
+    pixel, when, sign = noise or (np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.int8))
+    seen = light[0].astype(np.float64)
+    level, free = np.log(seen + eps), np.full(seen.shape, -np.inf)
+    held = np.zeros(seen.shape, bool)
+    rows: list[NDArray[np.float64]] = []
+
+    def fire(where: NDArray[np.bool_], at: float, polarity: int) -> None:
+        y, x = np.nonzero(where)
+        rows.append(np.stack([np.full(len(y), at), y, x, np.full(len(y), polarity)], 1))
+        if refractory_ns:
+            free[where], held[where] = at + refractory_ns, True
+
+    last, end = 0.0, float(at_ns[-1] - at_ns[0])
+    for now in np.append(np.arange(step_ns, end, step_ns), end - 1e-6):
+        given = _light_at(light, at_ns - at_ns[0], now, hold)
+        seen = given if not tau_ns else given + (seen - given) * np.exp((last - now) / tau_ns)
+        b = np.log(seen + eps)
+        level = np.where(held & (free <= now), b, level)
+        held &= free > now
+        for polarity, threshold in ((1, up), (-1, down)):
+            while np.any(over := ~held & (polarity * (b - level) >= threshold)):
+                fire(over, now, polarity)
+                level = np.where(over, level + polarity * threshold, level)
+        for k in np.flatnonzero((when > last) & (when <= now)):
+            y, x = divmod(int(pixel[k]), light.shape[2])
+            one = np.zeros(seen.shape, bool)
+            one[y, x] = not held[y, x]
+            fire(one, now, int(sign[k]))
+            level[one] = b[one]
+        last = now
+    found = np.concatenate([np.zeros((0, 4)), *rows])
+    found = found[np.lexsort((found[:, 2], found[:, 1], found[:, 0]))]
+    t, y, x, polarity = np.rint(found).astype(np.int64).T
+    return t, x.astype(np.uint16), y.astype(np.uint16), polarity.astype(np.int8)
+
+
+def _light_at(light: NDArray[np.float32], at_ns: NDArray[np.float64], now: float, hold: bool) -> NDArray[np.float64]:
+    k = min(max(int(np.searchsorted(at_ns, now, side="right")) - 1, 0), len(at_ns) - 2)
+    if hold:
+        return light[k].astype(np.float64)
+    w = (now - at_ns[k]) / (at_ns[k + 1] - at_ns[k])
+    return light[k] * (1 - w) + light[k + 1].astype(np.float64) * w

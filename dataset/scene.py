@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.clocktime import ClockModel, frozen_array
 from spikerig.dataset.errors import DataError, UsageError
+from spikerig.dataset.events import EventStream
 from spikerig.dataset.spikes import SpikeStream
 
 Floats = NDArray[np.float64]
@@ -217,6 +218,7 @@ class Scene:
     `light_gain` is the texture value (spikes a tick) of RGB white (linear 1.0): known for simulated scenes, measured
     by calibration for real ones, None where unknown. `info` is free provenance, JSON-ready. `clock` is the take's map
     of the spike camera's time to the rig's, `calibration` the rig's as a JSON-ready record; None where there is none.
+    `events` are those of the views that an event camera saw too, by view name.
     """
 
     name: str
@@ -228,6 +230,7 @@ class Scene:
     info: Mapping[str, Any] = field(default_factory=dict)
     clock: ClockModel | None = None
     calibration: Mapping[str, Any] | None = None
+    events: Mapping[str, EventStream] = field(default_factory=dict)
 
     def view(self, name: str) -> View:
         """The view of that name."""

@@ -84,6 +84,16 @@ SCHEMA = r"""
   @t0_ns                            | int   |        | start of tick 0
   @clock                            | text  |        | name of the clock of t0_ns
 /views/{view}/lost?                 | i8    | L 2    | half-open ranges of lost ticks; there if and only if spikes are
+/views/{view}/events?               | group |        | an event camera's look at the same light, in the order of time
+  @width                            | int   |        | pixels a row, at most 65536
+  @height                           | int   |        | rows, at most 65536
+  @t0_ns                            | int   |        | start of the span that was watched
+  @t1_ns                            | int   |        | its end, not in it
+  @clock                            | text  |        | name of the clock of these times
+/views/{view}/events/t_ns           | i8    | N      | times, not decreasing
+/views/{view}/events/x              | u2    | N      | columns
+/views/{view}/events/y              | u2    | N      | rows, 0 on top
+/views/{view}/events/polarity       | i1    | N      | 1 brighter, -1 darker
 /views/{view}/sensor_row            | f4    | H W    | row of the RGB sensor each pixel was read at
 /views/{view}/valid                 | u1    | H W    | 1 where both arms see, else 0
 /views/{view}/pose                  | f8    | 3 4    | cam_from_world of the spike camera, mid-exposure, middle row

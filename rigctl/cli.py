@@ -51,6 +51,9 @@ def frames(
     ] = None,
     protocol: Annotated[str, typer.Option(help="rig or paper, in place of the settings'.")] = "",
     seed: Annotated[int | None, typer.Option(help="Of noise and points, in place of the settings'.")] = None,
+    bad_values: Annotated[
+        str, typer.Option(help="NaN, infinite and negative light: refuse; zero; clip (infinite to the picture's most).")
+    ] = "refuse",
     workers: Annotated[int, typer.Option(help="Processes; 0: one a core. The bits do not depend on it.")] = 0,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
@@ -60,10 +63,16 @@ def frames(
     from spikerig.rigctl.sim.frames import capture_folder
 
     began = time.monotonic()
-    found = read_folder(folder, settings, protocol=protocol, seed=seed)
+    found = read_folder(folder, settings, protocol=protocol, seed=seed, bad_values=bad_values)
     bar = Progress(f"simulating '{found.rig.name}'", len(found.views), "views")
     told = capture_folder(found, out, workers=_workers(workers), force=force, done=lambda taken: bar.step())
     _tell("spikerig.sim.frames/1", out, told, began, as_json)
+    if told["bad_values"]["pictures"]:
+        bad = told["bad_values"]
+        note(
+            f"mended ({bad['how']}) in {bad['pictures']} pictures: {bad['nan']} NaN, {bad['infinite']} infinite, "
+            f"{bad['negative']} negative values"
+        )
     if told["points"] == 0:
         note("no initial points: training will start from random ones, some 10 dB worse; give points or depth")
 

@@ -88,12 +88,12 @@ def capture(
         UsageError: the file exists. HostError: the disk is full or a worker died.
     """
     takes = in_parallel(take_view, spec, spec.orbit.views, workers)
-    return pack(path, rig_of(spec), takes, info=provenance(spec), force=force, done=done)
+    return pack(path, rig_of(spec), takes, info=provenance(spec), views=spec.orbit.views, force=force, done=done)
 
 
 def provenance(spec: SceneSpec) -> dict[str, Any]:
     """How a scene was made, JSON-ready: the whole scene file as it was understood."""
     parts = {f.name: getattr(spec, f.name) for f in fields(spec) if f.name not in ("effects", "name", "seed")}
-    tables = {key: asdict(value) for key, value in parts.items()}
+    tables = {key: asdict(value) for key, value in parts.items() if value is not None}
     effects = {effect.name: parameters(effect) for effect in spec.effects}
     return {"made_by": "spikerig sim capture", "scene_file": {**tables, "effects": effects}}

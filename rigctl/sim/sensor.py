@@ -1,15 +1,14 @@
-"""Two sensors under the same light: integrate-and-fire pixels, and an RGB camera that averages its exposure."""
+"""Light over time, and the spike sensor under it: pixels that integrate and fire."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.errors import NumericsError, UsageError
-from spikerig.dataset.images import srgb_from_linear
 from spikerig.dataset.kernels import fire
 from spikerig.rigctl.sim.effects import Hooks
 from spikerig.rigctl.sim.spec import Sensor
@@ -28,6 +27,7 @@ class Light:
         exposure: (first tick, end tick) of the RGB exposure; both are knots.
         rate_hz: ticks a second.
         t0_ns: start of tick knots[0].
+        arm: what the RGB arm sees, where that is not what the spike arm sees (as rgb).
     """
 
     rgb: Floats
@@ -35,9 +35,12 @@ class Light:
     exposure: tuple[int, int]
     rate_hz: float
     t0_ns: int = 0
+    arm: Floats | None = None
 
     def __post_init__(self) -> None:
         k = len(self.rgb)
+        if self.arm is not None and self.arm.shape != self.rgb.shape:
+            raise UsageError("the two arms' light differs in shape", value=self.arm.shape, expected=str(self.rgb.shape))
         if self.rgb.ndim != 4 or self.rgb.shape[3] != 3 or len(self.knots) not in (k, k + 1):
             raise UsageError("light is rgb[K,H,W,3] with K or K+1 knots", value=(self.rgb.shape, len(self.knots)))
         if np.any(np.diff(self.knots) <= 0):
@@ -50,13 +53,71 @@ class Light:
         """Whether pictures hold rather than blend."""
         return len(self.knots) == len(self.rgb) + 1
 
-    def weights(self) -> NDArray[np.float64]:
-        """Share of each picture in the exposure, float64[K], sum 1: trapezoid rule, or slot lengths where they hold."""
-        inside = np.diff(self.knots) * ((self.knots[:-1] >= self.exposure[0]) & (self.knots[1:] <= self.exposure[1]))
-        if self.hold:
-            return inside / inside.sum()
-        both = np.concatenate([inside, [0]]) + np.concatenate([[0], inside])
-        return both / both.sum()
+    @property
+    def at_s(self) -> NDArray[np.float64]:
+        """The rig's time at each picture, seconds, float64[K]: at its knot, or the middle of the slot it holds for."""
+        knots = self.knots.astype(np.float64)
+        ticks = (knots[:-1] + knots[1:]) / 2 if self.hold else knots
+        return self.t0_ns * 1e-9 + (ticks - knots[0]) / self.rate_hz
+
+
+def refined(light: Light, step_s: float) -> Light:
+    """The same light with samples no further apart than asked for; a new one, whose pictures may be changed.
+
+    Args:
+        light: linear in time between its knots, or held.
+        step_s: longest time between samples; not below a tick.
+
+    Edges:
+        No step asked for (0) only copies. Where pictures hold, a slot that is cut holds the same picture in its parts.
+    """
+    most = max(1.0, step_s * light.rate_hz) if step_s > 0 else np.inf
+    spans = np.diff(light.knots)
+    parts = np.clip(np.ceil(spans / most - 1e-9), 1, spans).astype(np.int64)
+    if not parts.size or parts.max() == 1:  # nothing to cut
+        return replace(light, rgb=light.rgb.copy(), arm=None if light.arm is None else light.arm.copy())
+    k = np.repeat(np.arange(len(spans)), parts)
+    first = np.concatenate([[0], np.cumsum(parts)[:-1]])
+    share = (np.arange(len(k)) - np.repeat(first, parts)) / parts[k]
+    cut = np.rint(light.knots[k] + share * spans[k]).astype(np.int64)
+    knots = np.append(cut, light.knots[-1])
+
+    def along(pictures: Floats) -> Floats:
+        if light.hold:
+            return pictures[k]
+        w = ((cut - light.knots[k]) / spans[k]).astype(np.float32)[:, None, None, None]
+        inner = pictures[k] * (1 - w) + pictures[k + 1] * w
+        return np.concatenate([inner, pictures[-1:]])
+
+    return replace(light, rgb=along(light.rgb), knots=knots, arm=None if light.arm is None else along(light.arm))
+
+
+def delayed(light: Floats, knots: NDArray[np.int64], by: NDArray[np.float64]) -> tuple[Floats, NDArray[np.int64]]:
+    """Light as a sensor sees it whose tick n looks at time n - by: its clock is ahead.
+
+    Args:
+        light: float32[K,H,W] at knots [K] (linear) or [K+1] (hold).
+        knots: ticks.
+        by: ticks, float64 at each knot; what is asked for beyond the ends stands still.
+
+    Returns:
+        The light on a grid that has a knot at the nearest tick to each kink, and its knots.
+    """
+    if not np.any(by):
+        return light, knots
+    hold = len(knots) == len(light) + 1
+    moved = knots + by
+    if np.any(np.diff(moved) <= 0):
+        raise UsageError("a clock may not run backwards within a view", value=by)
+    inner = np.clip(np.rint(moved), knots[0], knots[-1]).astype(np.int64)
+    grid = np.unique(np.concatenate([[knots[0], knots[-1]], inner]))
+    if hold:
+        slot = np.clip(np.searchsorted(moved, (grid[:-1] + grid[1:]) / 2, side="right") - 1, 0, len(light) - 1)
+        return light[slot], grid
+    at = np.clip(grid, moved[0], moved[-1])
+    k = np.clip(np.searchsorted(moved, at, side="right") - 1, 0, len(light) - 2)
+    w = ((at - moved[k]) / (moved[k + 1] - moved[k])).astype(np.float32)[:, None, None]
+    return light[k] * (1 - w) + light[k + 1] * w, grid
 
 
 def spike_light(rgb: Floats, sensor: Sensor) -> Floats:
@@ -76,7 +137,7 @@ def spike_light(rgb: Floats, sensor: Sensor) -> Floats:
 
 
 def integrate(
-    light: Floats, knots: NDArray[np.int64], start: NDArray[np.float64], steps: Sequence[tuple[bool, Hooks]] = ()
+    light: Floats, knots: NDArray[np.int64], start: NDArray[np.float64], steps: Sequence[Hooks] = ()
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint32], NDArray[np.float64]]:
     """Integrate and fire (Eq. 5 and 6), the surplus kept, at most one spike a tick.
 
@@ -84,7 +145,7 @@ def integrate(
         light: float32[K,H,W], thresholds a tick; taken over (effects may change it in place).
         knots: int64[K] or [K+1], as in `Light`.
         start: float64[H,W] charge before the first tick, 0 to 1 thresholds.
-        steps: (per_tick, hooks) of the effects in stage order.
+        steps: hooks of the effects in stage order.
 
     Returns:
         bits uint8[T,H,ceil(W/8)], charge left uint32[H,W] in 2^-32 thresholds, charge clipped float64[H,W] in
@@ -93,10 +154,10 @@ def integrate(
     Cost:
         Without per-tick effects the light is only touched at its knots.
     """
-    hooks = [(per_tick, h.light) for per_tick, h in steps if h.light is not None]
-    first = next((i for i, (per_tick, _) in enumerate(hooks) if per_tick), len(hooks))
-    for _, change in hooks[:first]:
-        change(light)
+    hooks = [h for h in steps if h.light is not None]
+    first = next((i for i, h in enumerate(hooks) if h.per_tick), len(hooks))
+    for h in hooks[:first]:
+        h.light(light)  # type: ignore[misc]
     charge = np.minimum(np.floor(start * 2.0**32), 2.0**32 - 1).astype(np.uint32)
     hold = len(knots) == len(light) + 1
     if first == len(hooks):
@@ -105,8 +166,8 @@ def integrate(
     clipped = np.zeros(light.shape[1:])
     at = 0
     for block in _ticks(light, knots, hold):
-        for _, change in hooks[first:]:
-            change(block)
+        for h in hooks[first:]:
+            h.light(block)  # type: ignore[misc]
         n = len(block)
         bits[at : at + n], charge, lost = fire(block, np.arange(n + 1), charge, hold=True)
         clipped += lost
@@ -128,21 +189,3 @@ def _ticks(light: Floats, knots: NDArray[np.int64], hold: bool) -> Iterable[Floa
                 block = (light[k + 1] - light[k]) * w
                 block += light[k]
                 yield block
-
-
-def expose(light: Light) -> NDArray[np.float64]:
-    """Mean linear light over the exposure, float64[H,W,3]."""
-    total = np.zeros(light.rgb.shape[1:])
-    for weight, picture in zip(light.weights(), light.rgb, strict=True):
-        if weight:
-            total += weight * picture
-    return total
-
-
-def encode(linear: NDArray, hooks: Iterable[Hooks] = ()) -> NDArray[np.uint8]:
-    """8-bit sRGB of linear light: clip to 0..1, sRGB, the effects on the encoded picture, round; uint8[H,W,3]."""
-    picture = srgb_from_linear(np.clip(linear, 0, 1)).astype(np.float32)
-    for h in hooks:
-        if h.encoded is not None:
-            h.encoded(picture)
-    return np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)

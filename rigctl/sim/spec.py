@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from spikerig.dataset.errors import UsageError
-from spikerig.rigctl.sim.effects import Effect, read_effects
+from spikerig.dataset.errors import RigError, UsageError
+from spikerig.rigctl.sim.effects import Effect, effect_class, in_order, read_effects
 from spikerig.rigctl.sim.limits import Faults, limits, nearest, read_record
 from spikerig.rigctl.sim.orbit import Orbit, orbit_pose
+from spikerig.rigctl.sim.presets import PRESETS, preset_effects, preset_names
 from spikerig.rigctl.sim.world import Vec3, World, read_world, stands_in
 
 
@@ -91,12 +92,40 @@ class Sensor:
     """`[sensor]`: light to charge.
 
     Args:
+        preset: a published spike camera: its effects become those to choose from, its settings the defaults.
+        map: with `vidar-map`, the sensor's own maps (.npz; see effect `sensor_map`); its path from the scene file.
         gain: spikes a tick at RGB white (1 / threshold in the paper's units); 0.4, or 0.5 for `paper`.
         response: of the spike camera to linear red, green and blue.
     """
 
+    preset: str = limits("", choices=preset_names("spike"))
+    map: str = limits("", unit="a .npz file")
     gain: float = limits(0.4, 1e-9, 1e9, "spikes a tick at white")
     response: Vec3 = limits((0.299, 0.587, 0.114), 0, 100)
+
+
+@dataclass(frozen=True, slots=True)
+class RgbCamera:
+    """`[rgb]`: the other camera.
+
+    Args:
+        preset: a published RGB camera: its effects become those to choose from.
+    """
+
+    preset: str = limits("", choices=preset_names("rgb"))
+
+
+@dataclass(frozen=True, slots=True)
+class Tolerance:
+    """`[tolerance]`: with `effects = "auto"`, how much all that is left out may change 95 % of the pixels.
+
+    Args:
+        spikes: of the count of one exposure.
+        dn: of an RGB value.
+    """
+
+    spikes: float = limits(1.0, 0, 1e9, "spikes an exposure")
+    dn: float = limits(1.0, 0, 1e9, "digital numbers of 255")
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,11 +146,19 @@ class Settings:
     sensor: Sensor
     cloud: Cloud
     effects: tuple[Effect, ...]
+    rgb: RgbCamera = RgbCamera()
+    tolerance: Tolerance | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class SceneSpec:
-    """A whole scene file."""
+    """A whole scene file.
+
+    Args:
+        effects: in the order in which they act: those to simulate, or with a tolerance those to choose from.
+        tolerance: of `effects = "auto"`; None once the effects are chosen, or were listed.
+        others: as in the file.
+    """
 
     name: str
     seed: int
@@ -133,15 +170,20 @@ class SceneSpec:
     cloud: Cloud
     world: World
     effects: tuple[Effect, ...]
+    rgb: RgbCamera = RgbCamera()
+    tolerance: Tolerance | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class _Top:
     name: str = limits("")
     seed: int = limits(0, 0, 2**32 - 1)
-    effects: Any = limits(())
+    effects: Any = limits(None)
+    consider: Any = limits(())
+    tolerance: Any = limits({})
     exposure: Any = limits({})
     sensor: Any = limits({})
+    rgb: Any = limits({})
     points: Any = limits({})
 
 
@@ -197,13 +239,50 @@ def read_settings(table: Mapping[str, Any], source: str) -> Settings:
 def _settings(top: _Top, faults: Faults) -> Settings:
     paper = isinstance(top.exposure, Mapping) and top.exposure.get("protocol") == "paper"
     exposure = read_record(Exposure, top.exposure, "exposure", faults, PAPER if paper else None)
-    sensor = read_record(Sensor, top.sensor, "sensor", faults, {"gain": 0.5} if paper else None)
+    sensor = read_record(Sensor, top.sensor, "sensor", faults, _sensor_defaults(top.sensor, paper))
+    rgb = read_record(RgbCamera, top.rgb, "rgb", faults)
     cloud = read_record(Cloud, top.points, "points", faults)
-    effects = read_effects(top.effects, exposure.phase, faults)
+    tolerance = read_record(Tolerance, top.tolerance, "tolerance", faults)
+    effects = _effects(top, preset_effects(sensor.preset, rgb.preset, map=sensor.map), exposure.phase, faults)
+    if (sensor.preset == "vidar-map") != bool(sensor.map):
+        faults.add("sensor.map", f"is '{sensor.map}', preset '{sensor.preset}': a map and preset vidar-map go together")
     _check_exposure(exposure, faults)
     if sum(sensor.response) <= 0:
         faults.add("sensor.response", "is all zero: the spike camera would be blind")
-    return Settings(top.name, top.seed, exposure, sensor, cloud, effects)
+    auto = tolerance if top.effects == "auto" else None
+    return Settings(top.name, top.seed, exposure, sensor, cloud, effects, rgb, auto)
+
+
+def _sensor_defaults(table: Any, paper: bool) -> Mapping[str, Any]:
+    name = table.get("preset") if isinstance(table, Mapping) else None
+    preset = PRESETS[name].settings if isinstance(name, str) and name in PRESETS else {}
+    return {**({"gain": 0.5} if paper else {}), **preset}
+
+
+def _effects(top: _Top, presets: list[Mapping[str, Any]], phase: str, faults: Faults) -> tuple[Effect, ...]:
+    """Those listed; or, of the words `auto` and `all` (and of a preset alone), those considered: what differs from the
+    preset's parameters is said in `consider`."""
+    if top.effects in ("auto", "all") or (top.effects is None and presets):
+        found = {**read_effects(presets, faults, "preset"), **read_effects(top.consider, faults, "consider")}
+        if top.effects == "auto" and not found and not (top.consider or presets):
+            faults.add("effects", 'is "auto" with nothing to choose from; name a sensor.preset, or list `consider`')
+    else:
+        if top.consider not in ((), []):
+            faults.add("consider", 'is for effects = "auto" or "all"; list the effects wanted in one place')
+        found = read_effects(top.effects if top.effects is not None else (), faults)
+    if "initial_phase" in found and phase == "zero":
+        faults.add("effects", "list initial_phase, but exposure.phase is zero: these contradict each other")
+    if phase == "random" and "initial_phase" not in found:
+        found["initial_phase"] = effect_class("initial_phase")()
+    for name, effect in found.items():
+        for other in set(getattr(effect, "excludes", ())) & set(found):
+            faults.add("effects", f"list {name} and {other}: the same thing would count twice")
+        if hasattr(effect, "placed"):
+            try:
+                found[name] = effect.placed(Path(faults.source).parent)
+            except RigError as error:
+                faults.add(f"effects.{name}", f"{error.what}: {error.value}")
+    return in_order(found.values())
 
 
 def _check_exposure(exposure: Exposure, faults: Faults) -> None:
@@ -231,6 +310,8 @@ def read_scene(table: Mapping[str, Any], source: str = "the scene") -> SceneSpec
         cloud=settings.cloud,
         world=read_world(top.world, faults),
         effects=settings.effects,
+        rgb=settings.rgb,
+        tolerance=settings.tolerance,
     )
     if not faults.found:
         _check_views(spec, faults)

@@ -20,9 +20,11 @@ from spikerig.dataset.errors import HostError
 from spikerig.dataset.kernels import count
 from spikerig.dataset.scene import Camera, Frame, Points, Pose, Trajectory, Truth, View
 from spikerig.rigctl.sim.draws import stream
-from spikerig.rigctl.sim.effects import Effect, parameters
+from spikerig.rigctl.sim.effects import Effect, Site, parameters
+from spikerig.rigctl.sim.effects import Stage as EffectStage
+from spikerig.rigctl.sim.rgb import encode
 from spikerig.rigctl.sim.schedule import Schedule, Track, phase_ns, start_ns
-from spikerig.rigctl.sim.sensor import Light, encode
+from spikerig.rigctl.sim.sensor import Light
 from spikerig.rigctl.sim.simulate import simulate
 from spikerig.rigctl.sim.spec import Cloud, Exposure, Sensor
 
@@ -92,20 +94,23 @@ def take_blurry(
     sharp: NDArray[np.float32],
     track: Track,
     rgb: NDArray[np.float32],
+    arm: NDArray[np.float32] | None = None,
 ) -> Taken:
     """A view for training: spikes over exposure and margins, and the blurry picture.
 
     Args:
         rig, number, name, plan, sharp, track: as for `take_sharp`.
         rgb: linear light float32[K,H,W,3] at `plan.phases`.
+        arm: the same as the RGB arm sees it, where that differs.
     """
     exposure = rig.exposure
     view, at_ns, path = _labelled(rig, number, name, plan, track, "train")
     first = int(plan.knots[0])
     t0_ns = start_ns(exposure, number) + round(first * exposure.tick_ns)
-    light = Light(rgb, plan.knots - first, (-first, exposure.ticks - first), exposure.rate_hz, t0_ns)
-    seen = simulate(light, rig.sensor, rig.effects, rig.seed, number)
-    error = seen.frame.pixels.astype(np.float64) - encode(sharp)
+    light = Light(rgb, plan.knots - first, (-first, exposure.ticks - first), exposure.rate_hz, t0_ns, arm)
+    seen = simulate(light, rig.sensor, rig.effects, rig.seed, number, rig.camera)
+    full = 255 / np.iinfo(seen.frame.pixels.dtype).max
+    error = seen.frame.pixels * full - encode(sharp)
     counts = count(seen.spikes.bits, rig.camera.width, -first, exposure.ticks - first)
     blur_db = 20 * np.log10(255 / max(float(np.sqrt(np.mean(error**2))), 1e-9))
     view = replace(view, frame=seen.frame, spikes=seen.spikes, trajectory=path)
@@ -191,6 +196,7 @@ def pack(
     *,
     info: Mapping[str, Any],
     points: Points | None = None,
+    views: int = 0,
     force: bool = False,
     done: Callable[[Taken], None] = lambda taken: None,
 ) -> dict[str, Any]:
@@ -202,6 +208,7 @@ def pack(
         takes: in order.
         info: provenance.
         points: instead of those of the views.
+        views: how many will come; only effects on the clock need to know.
         force: replace an existing file.
         done: called after each view is written.
 
@@ -209,12 +216,12 @@ def pack(
         What was made, JSON-ready.
 
     Raises:
-        UsageError: the file exists. HostError: the disk is full.
+        UsageError: the file exists; the spike camera's clock steps back. HostError: the disk is full.
     """
     from spikerig.dataset.store import SceneWriter
 
     effects = {effect.name: parameters(effect) for effect in rig.effects}
-    truth = Truth({}, {}, {}, ClockModel.identity(), effects, rig.seed, rig.exposure.label)
+    truth = Truth({}, {}, {}, true_clock(rig, views), effects, rig.seed, rig.exposure.label)
     told: list[Taken] = []
     more = {"light_gain": rig.light_gain, "info": info, "truth": truth}
     # keep=False: what a simulation left half done can be made again
@@ -228,6 +235,30 @@ def pack(
             points = Points(xyz, rgb, "simulator")
         out.points = points if len(points.xyz) else None
     return _report(rig, told, len(points.xyz)) | {"effects": effects}
+
+
+def true_clock(rig: Rig, views: int) -> ClockModel:
+    """The exact map from the spike camera's time to the rig's: a knot at both ends of each view's spikes.
+
+    Raises:
+        UsageError: the clock steps back from one view to the next.
+    """
+    clocks = [effect for effect in rig.effects if effect.stage == EffectStage.CLOCK]
+    if not clocks or not views:
+        return ClockModel.identity()
+    exposure, margin = rig.exposure, rig.exposure.margin_ticks
+    ends = np.rint(np.array([-margin, exposure.ticks + margin]) * exposure.tick_ns).astype(np.int64)
+    at_ns = np.array([start_ns(exposure, number) + ends for number in range(views)])
+    ahead = np.zeros(at_ns.shape)
+    for number, both in enumerate(at_ns):
+        t0_s = float(both[0]) * 1e-9
+        site = Site(rig.camera.height, rig.camera.width, number, rig.seed, exposure.rate_hz, t0_s)
+        for effect in clocks:
+            clock = effect.begin(site).clock_ns
+            if clock is not None:
+                ahead[number] += clock(both)
+    rig_ns = at_ns.reshape(-1)
+    return ClockModel(rig_ns + np.rint(ahead.reshape(-1)).astype(np.int64), rig_ns, np.zeros(len(rig_ns)), 0.0)
 
 
 def _report(rig: Rig, told: list[Taken], points: int) -> dict[str, Any]:

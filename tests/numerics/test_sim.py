@@ -58,7 +58,7 @@ def test_charge_is_conserved(hold: bool) -> None:
     exact = light.astype(np.float64)
     total = sum(n * (exact[k] if hold else (exact[k] + exact[k + 1]) / 2) for k, n in enumerate(steps))
     assert np.array_equal(total, fired + (left / 2.0**32 - start) + clipped)
-    by_tick = integrate(light.copy(), knots, start, [(True, Hooks(light=lambda block: None))])
+    by_tick = integrate(light.copy(), knots, start, [Hooks(light=lambda block: None, per_tick=True)])
     back = counts(by_tick[0], 11) + (by_tick[1] / 2.0**32 - start) + by_tick[2]
     assert np.array_equal(total, back) if hold else np.allclose(total, back, rtol=1e-6)
     assert (clipped > 0).any()

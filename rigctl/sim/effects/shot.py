@@ -8,7 +8,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.rigctl.sim.effects import Facts, Floats, Hooks, Site, Stage
+from spikerig.rigctl.sim.effects import Floats, Hooks, Site, Stage
+from spikerig.rigctl.sim.facts import Bound, Facts
 from spikerig.rigctl.sim.limits import limits
 
 FEW = 4.0  # electrons a tick below which counts are drawn exactly
@@ -30,8 +31,7 @@ class ShotNoise:
 
     name: ClassVar[str] = "shot_noise"
     stage: ClassVar[Stage] = Stage.PHOTONS
-    per_tick: ClassVar[bool] = True
-    unit: ClassVar[str] = "spikes an exposure"
+    per: ClassVar[str] = "tick"
     source: ClassVar[str] = "Poisson statistics; SpikingSIM real_spike, 41-frame count variance 0.181 against 0.165"
     vanishes: ClassVar[str] = "threshold_e -> infinity"
     cost_ns: ClassVar[float] = 14.0
@@ -55,11 +55,15 @@ class ShotNoise:
             block.reshape(-1)[dim] = few
             block /= electrons
 
-        return Hooks(light=light)
+        return Hooks(light=light, per_tick=True)
 
-    def magnitude(self, facts: Facts) -> float:
-        """Three standard deviations of the brightest pixel's count: 3 sqrt(light ticks / threshold_e)."""
-        return float(3 * np.sqrt(min(facts.light_max, 1.0) * facts.ticks / self.threshold_e))
+    def magnitude(self, facts: Facts) -> Bound:
+        """Charge of standard deviation sqrt(light ticks / threshold_e), in the exposure and in the margin before."""
+        sd = np.sqrt(facts.rate / self.threshold_e)
+        within, before = facts.normal(2) * sd * np.sqrt([[[facts.ticks]], [[facts.margin_ticks]]])
+        rate = facts.most(facts.rate)
+        told = f"z sqrt({rate:.3g} x {facts.ticks} / {self.threshold_e:g}), and of {facts.margin_ticks} ticks before"
+        return Bound(facts.counted(within, before), 0.0, told)
 
 
 def normal_cdf(z: NDArray[np.float64]) -> NDArray[np.float64]:
