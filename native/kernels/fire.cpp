@@ -134,9 +134,13 @@ struct Pixels {
   }
 
   template <bool ramps, bool carry>
-  void run_segment(int64_t pixels, int64_t ticks, uint8_t *out, int64_t frame, int64_t bytes) {
-    const double share = 1.0 / static_cast<double>(ticks);
-    for (int64_t g = 0; g < pixels; g += GROUP) bright[g / GROUP] = ramp.begin<ramps, carry>(g, GROUP, share);
+  void run_segment(int64_t pixels, int64_t whole, int64_t done, int64_t ticks, uint8_t *out, int64_t frame,
+                   int64_t bytes) {
+    const double share = 1.0 / static_cast<double>(whole);
+    for (int64_t g = 0; g < pixels; g += GROUP) {
+      bright[g / GROUP] = ramp.begin<ramps, carry>(g, GROUP, share);
+      if (ramps) ramp.skip(g, GROUP, done);
+    }
     for (int64_t t = 0; t < ticks; t += TICKS) {
       charges.settle(std::min(TICKS, ticks - t));
       for (int64_t g = 0; g < pixels; g += GROUP) {
@@ -172,22 +176,23 @@ void fire(const Light &light, bool carry, int64_t *charge, uint8_t *bits, double
         if (state.charges.whole[i + j]) state.owing[(i + j) / GROUP] = true;
       }
     });
-    for (int64_t k = 0; k < light.segments; ++k) {
-      const int64_t ticks = light.knots[k + 1] - light.knots[k];
-      if (ticks == 0) continue;
+    each_segment(light, [&](int64_t k, int64_t whole, int64_t done, int64_t first) {
       const float *from = light.rows + k * image, *to = light.hold ? from : from + image;
       each_run([&](int64_t i, int64_t pixel, int64_t n) {
         std::copy_n(from + pixel, n, state.ramp.from + i);
         std::copy_n(to + pixel, n, state.ramp.to + i);
       });
-      uint8_t *out = bits + (light.knots[k] - light.knots[0]) * frame + at.begin;
+      const int64_t ticks = std::min(light.knots[k + 1], light.end) - first;
+      uint8_t *out = bits + (first - light.begin) * frame + at.begin;
+      const auto run = [&](auto ramps, auto all) {
+        state.run_segment<decltype(ramps)::value, decltype(all)::value>(pixels, whole, done, ticks, out, frame,
+                                                                        at.bytes());
+      };
       if (light.hold)
-        carry ? state.run_segment<false, true>(pixels, ticks, out, frame, at.bytes())
-              : state.run_segment<false, false>(pixels, ticks, out, frame, at.bytes());
+        carry ? run(Flag<false>{}, Flag<true>{}) : run(Flag<false>{}, Flag<false>{});
       else
-        carry ? state.run_segment<true, true>(pixels, ticks, out, frame, at.bytes())
-              : state.run_segment<true, false>(pixels, ticks, out, frame, at.bytes());
-    }
+        carry ? run(Flag<true>{}, Flag<true>{}) : run(Flag<true>{}, Flag<false>{});
+    });
     each_run([&](int64_t i, int64_t pixel, int64_t n) {
       for (int64_t j = 0; j < n; ++j) {
         charge[pixel + j] = static_cast<int64_t>(state.charges.whole[i + j]) << 32 | state.charges.word[i + j];

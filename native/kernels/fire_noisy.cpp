@@ -49,29 +49,29 @@ void fire_noisy(const Light &light, int64_t first_tick, const Noise &noise, bool
       }
     });
     if (before) std::memcpy(s.draws.before, before + at.begin, static_cast<size_t>(at.bytes()));
-    for (int64_t k = 0; k < light.segments; ++k) {
-      const int64_t ticks = light.knots[k + 1] - light.knots[k];
-      if (ticks == 0) continue;
+    each_segment(light, [&](int64_t k, int64_t whole, int64_t done, int64_t begin) {
       const float *from = light.rows + k * image, *to = light.hold ? from : from + image;
       each_run([&](int64_t i, int64_t pixel, int64_t n) {
         std::copy_n(from + pixel, n, s.ramp.from + i);
         std::copy_n(to + pixel, n, s.ramp.to + i);
       });
-      const double share = 1.0 / static_cast<double>(ticks);
-      constexpr int64_t ROW = 64;
-      for (int64_t i = 0; i < pixels; i += ROW)
-        light.hold ? s.ramp.begin<false, true>(i, ROW, share) : s.ramp.begin<true, true>(i, ROW, share);
-      const int64_t since = light.knots[k] - light.knots[0];
-      for (int64_t t = 0; t < ticks; t += TICKS) {
-        const int64_t n = std::min(TICKS, ticks - t), first = first_tick + since + t;
+      const double share = 1.0 / static_cast<double>(whole);
+      if (light.hold)
+        s.ramp.begin<false, true>(0, PIXELS, share);
+      else
+        s.ramp.begin<true, true>(0, PIXELS, share);
+      s.ramp.skip(0, PIXELS, done);
+      const int64_t end = std::min(light.knots[k + 1], light.end);
+      for (int64_t t = begin; t < end; t += TICKS) {
+        const int64_t n = std::min(TICKS, end - t), since = t - light.begin, first = first_tick + since;
         s.charges.settle(n);
         for (int64_t i = 0; i < pixels; i += AT_ONCE * LANES)
           run(s.ramp, s.charges, &s.draws, &noise, carry ? INT32_MAX : 1, i, n, first,
-              bits + (since + t) * frame + at.begin + i / 8, frame, at.bytes() - i / 8);
+              bits + since * frame + at.begin + i / 8, frame, at.bytes() - i / 8);
         s.draws.quad = (first + n - 1) >> 2;
         s.draws.drawn = true;
       }
-    }
+    });
     each_run([&](int64_t i, int64_t pixel, int64_t n) {
       for (int64_t j = 0; j < n; ++j) {
         charge[pixel + j] = static_cast<int64_t>(static_cast<uint64_t>(s.charges.whole[i + j]) << 32 |
