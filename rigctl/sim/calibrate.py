@@ -21,6 +21,7 @@ from spikerig.rigctl.sim.effects import Effect
 from spikerig.rigctl.sim.plan import Plan
 from spikerig.rigctl.sim.schedule import Schedule, Track, track_phases
 from spikerig.rigctl.sim.sensor import Light
+from spikerig.rigctl.sim.shelf import dumps, loads
 from spikerig.rigctl.sim.spec import Cloud
 from spikerig.rigctl.sim.take import Rig, Taken, pack, surface, take_blurry
 
@@ -156,12 +157,17 @@ def _every_view(work: Work, light: Light) -> dict[str, float]:
 
         def write(block: _Block, one: Taken, views: int) -> float:
             named = [replace(one, view=replace(one.view, name=f"{k:03d}")) for k in range(views)]
-            return least(lambda: pack(file, block.rig, named, info={}, force=True), 2)
+            return least(lambda: pack(file, block.rig, (shelved(k) for k in named), info={}, force=True), 2)
 
         few, more, large = write(a, taken[0], 1), write(a, taken[0], 4), write(b, taken[1], 4)
     each = _line(max(more - few, 0.0) / 3, max(large - few, 0.0) / 3, a, b)
     parts["file"] = few + (work.train - 1) * each + work.test * max(more - few, 0.0) / 3
     return parts
+
+
+def shelved(taken: Taken) -> Taken:
+    """A view as it comes back from where finished views wait."""
+    return loads(dumps(taken), taken.view.name)
 
 
 def _effects(work: Work, light: Light, effects: Sequence[Effect], on: set[str]) -> dict[str, float]:
