@@ -20,8 +20,8 @@ from spikerig.dataset.terminal import jsonable
 from spikerig.rigctl.sim.capture import provenance, rig_of, settled
 from spikerig.rigctl.sim.farm import Cluster, fill, finished
 from spikerig.rigctl.sim.limits import nearest
-from spikerig.rigctl.sim.shelf import Shelf, alone, differences, fingerprint, write_whole
 from spikerig.rigctl.sim.plan import Plan
+from spikerig.rigctl.sim.shelf import Shelf, alone, differences, fingerprint, write_whole
 from spikerig.rigctl.sim.spec import SceneSpec, builtin_names, load_scene_toml, with_changes
 from spikerig.rigctl.sim.take import pack
 
