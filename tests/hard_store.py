@@ -243,7 +243,7 @@ ROWS = [
         "luminance-chroma, deep, multi-view, tiled, lone channels",
         "read_image (EXR)",
         "read or refused, as listed",
-        "dataset/test_images.py::test_awkward_exr_files_are_read_or_refused",
+        "dataset/test_exr.py::test_awkward_exr_files_are_read_or_refused",
     ),
     (
         "a picture claiming 100,000 x 100,000",

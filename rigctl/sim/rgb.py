@@ -65,18 +65,19 @@ def shares_of(light: Light, at: NDArray[np.float64], weight: NDArray[np.float64]
     later = np.zeros(at.shape) if light.hold else (at - knots[k]) / (knots[k + 1] - knots[k])
     row = np.arange(len(at))[:, None] * len(knots) + k
     size = len(at) * len(knots)
-    total = np.bincount(row.ravel(), (weight * (1 - later)).ravel(), size)
-    total += np.bincount(row.ravel() + 1, (weight * later).ravel(), size + 1)[:size]
-    return total.reshape(len(at), len(knots))[:, : len(light.rgb)]
+    total = np.zeros(size + 1)
+    np.add.at(total, row, weight * (1 - later))
+    np.add.at(total, row + 1, weight * later)
+    return total[:size].reshape(len(at), len(knots))[:, : len(light.rgb)]
 
 
 def wave_means(light: Light, hz: float) -> tuple[Floats, Floats]:
     """Mean over the exposure of linear light x cos and x sin of 2 pi hz t, t from its start; float64[H,W,3] each."""
     begin, end = light.exposure
-    after = (np.arange(4096) + 0.5) * ((end - begin) / 4096)
+    after = np.asarray((np.arange(4096) + 0.5) * ((end - begin) / 4096), np.float64)
     angle = 2 * np.pi * hz * after / light.rate_hz
     waves = np.stack([np.cos(angle), np.sin(angle)]) / 4096
-    cosine, sine = np.tensordot(shares_of(light, np.tile(begin + after, (2, 1)), waves), light.rgb, 1)
+    cosine, sine = np.tensordot(shares_of(light, np.stack([begin + after] * 2), waves), light.rgb, 1)
     return cosine, sine
 
 

@@ -6,7 +6,7 @@ Beyond the edge lies the edge's light.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,23 +152,23 @@ def straight(x: NDArray, y: NDArray, k: tuple[float, float, float, float]) -> Po
     return u, v
 
 
-def blur_kernel(points: Iterable[tuple[float, float]]) -> NDArray[np.float64]:
+def blur_kernel(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """The kernel that averages a picture's shifted copies; odd and square, float64, sums to 1.
 
     Args:
-        points: shifts (x, y), pixels. Second moments are kept exactly (the interpolation reproduces quadratics).
+        points: shifts (x, y), pixels, float64[n,2]. Second moments are kept exactly (the interpolation reproduces
+            quadratics).
     """
-    at = np.array(list(points), np.float64)
-    reach = int(np.ceil(np.abs(at).max(initial=0))) + 2
+    reach = int(np.ceil(np.abs(points).max(initial=0))) + 2
     size = 2 * reach + 1
-    rows = []
-    for axis in (0, 1):
-        whole = np.floor(at[:, axis]).astype(int)
-        row = np.zeros((len(at), size))
-        for k, weight in enumerate(cubic(at[:, axis] - whole)):
-            row[np.arange(len(at)), reach + whole + k - 1] = weight
-        rows.append(row)
-    return rows[1].T @ rows[0] / len(at)
+    whole = np.floor(points).astype(np.intp)
+    across, down = (cubic(points[:, axis] - whole[:, axis]) for axis in (0, 1))
+    corner = (whole[:, 1] + reach - 1) * size + whole[:, 0] + reach - 1
+    kernel = np.zeros(size * size)
+    for j in range(4):
+        for i in range(4):
+            kernel += np.bincount(corner + j * size + i, down[j] * across[i], size * size)
+    return kernel.reshape(size, size) / len(points)
 
 
 def blurred(pictures: Floats, kernel: NDArray[np.float64]) -> Floats:

@@ -36,10 +36,10 @@ class Distortion:
 
     name: ClassVar[str] = "distortion"
     stage: ClassVar[Stage] = Stage.OPTICS
-    per: ClassVar[str] = "knot"
+    per: ClassVar[str] = "frame"
     source: ClassVar[str] = "Brown-Conrady as in OpenCV's calib3d"
     vanishes: ClassVar[str] = "k1 = k2 = p1 = p2 = 0"
-    cost_ns: ClassVar[float] = 60.0
+    cost_ns: ClassVar[float] = 600.0
 
     @property
     def coefficients(self) -> tuple[float, float, float, float]:

@@ -30,7 +30,7 @@ class MirrorFlip:
     per: ClassVar[str] = "knot"
     source: ClassVar[str] = "reflection; an even number of mirrors cancels"
     vanishes: ClassVar[str] = "left out; twice is not at all"
-    cost_ns: ClassVar[float] = 1.0
+    cost_ns: ClassVar[float] = 2.0
 
     def begin(self, site: Site) -> Hooks:
         """The same for every view."""

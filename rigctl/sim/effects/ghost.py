@@ -35,7 +35,7 @@ class Ghost:
     per: ClassVar[str] = "knot"
     source: ClassVar[str] = "Fresnel: glass of n = 1.5 reflects ((n - 1) / (n + 1))^2 = 4 % at each surface"
     vanishes: ClassVar[str] = "share = 0"
-    cost_ns: ClassVar[float] = 60.0
+    cost_ns: ClassVar[float] = 5.0
 
     def begin(self, site: Site) -> Hooks:
         """The same for every view."""

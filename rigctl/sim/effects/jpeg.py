@@ -32,8 +32,8 @@ class Jpeg:
     stage: ClassVar[Stage] = Stage.RGB
     per: ClassVar[str] = "frame"
     source: ClassVar[str] = "ITU-T T.81 through OpenCV's libjpeg-turbo"
-    vanishes: ClassVar[str] = 'left out; quality = 100 with colour = "4:4:4" stays within 2 codes'
-    cost_ns: ClassVar[float] = 40.0
+    vanishes: ClassVar[str] = 'left out; quality = 100 with colour = "4:4:4" stays within 4 codes'
+    cost_ns: ClassVar[float] = 21.0
 
     def begin(self, site: Site) -> Hooks:
         """The same for every view."""
@@ -52,7 +52,8 @@ class Jpeg:
         sampling = {"4:2:0": 0x221111, "4:4:4": 0x111111}[self.colour]
         how = [cv2.IMWRITE_JPEG_QUALITY, self.quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
         file = cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]), how)[1]
-        return np.ascontiguousarray(cv2.imdecode(file, cv2.IMREAD_COLOR)[..., ::-1])
+        back = np.asarray(cv2.imdecode(file, cv2.IMREAD_COLOR), np.uint8)
+        return np.ascontiguousarray(back[..., ::-1])
 
     def magnitude(self, facts: Facts) -> Bound:
         """What the surveyed views lose."""

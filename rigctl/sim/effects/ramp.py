@@ -32,7 +32,7 @@ class BrightnessRamp:
     per: ClassVar[str] = "knot"
     source: ClassVar[str] = "stated definition"
     vanishes: ClassVar[str] = "per_s = 0"
-    cost_ns: ClassVar[float] = 2.0
+    cost_ns: ClassVar[float] = 0.2
 
     def begin(self, site: Site) -> Hooks:
         """The same ramp for every view."""

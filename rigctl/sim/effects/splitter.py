@@ -32,7 +32,7 @@ class Splitter:
     per: ClassVar[str] = "knot"
     source: ClassVar[str] = "conservation of energy; plate splitters are sold as 50:50 within 5 to 10 % of the light"
     vanishes: ClassVar[str] = "share = 1/2, loss = 0"
-    cost_ns: ClassVar[float] = 1.0
+    cost_ns: ClassVar[float] = 0.3
 
     @property
     def gains(self) -> tuple[float, float]:

@@ -35,7 +35,7 @@ class Vignetting:
     per: ClassVar[str] = "knot"
     source: ClassVar[str] = "the cos^4 law; an even polynomial of the radius (Goldman and Chen, ICCV 2005)"
     vanishes: ClassVar[str] = "power = k2 = k4 = 0"
-    cost_ns: ClassVar[float] = 1.5
+    cost_ns: ClassVar[float] = 0.5
 
     def gain(self, radius: Floats, tangent: Floats) -> NDArray[np.float64]:
         """Factor of the light at a radius (1 in the corner) and a tangent of the angle off the axis; not below 0."""
