@@ -19,7 +19,7 @@ from spikerig.rigctl.sim.orbit import orbit_pose, target_depth
 from spikerig.rigctl.sim.schedule import Track, schedule, track_phases
 from spikerig.rigctl.sim.shake import ShakePath, shake_path
 from spikerig.rigctl.sim.spec import SceneSpec
-from spikerig.rigctl.sim.take import Rig, Taken, pack, share_of, surface, take_blurry, take_sharp
+from spikerig.rigctl.sim.take import Rig, Taken, pack, share_of, surface, take_blurry, take_sharp, true_clock
 
 
 def camera_of(spec: SceneSpec) -> Camera:
@@ -106,6 +106,7 @@ def capture(
 
     path = Path(path)
     refuse_existing(path, force)
+    true_clock(rig_of(spec), spec.orbit.views)  # one that steps back is refused before any work
     made = {"name": spec.name, "seed": spec.seed, **provenance(spec), "made_with": fingerprint()}
     folder, views = path.with_name(path.name + ".views"), spec.orbit.views
     with alone(folder):

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spikerig.dataset.bayer import PATTERNS, Bayer
-from spikerig.dataset.errors import RigError, UsageError
-from spikerig.rigctl.sim.effects import Effect, effect_class, in_order, read_effects
+from spikerig.dataset.errors import UsageError
+from spikerig.rigctl.sim.effects import Effect, effect_class, in_order, read_effects, settled
 from spikerig.rigctl.sim.limits import Faults, limits, nearest, read_record
 from spikerig.rigctl.sim.orbit import Orbit, orbit_pose
 from spikerig.rigctl.sim.presets import PRESETS, preset_effects, preset_names
@@ -304,16 +304,7 @@ def _effects(top: _Top, presets: list[Mapping[str, Any]], phase: str, faults: Fa
         faults.add("effects", "list initial_phase, but exposure.phase is zero: these contradict each other")
     if phase == "random" and "initial_phase" not in found:
         found["initial_phase"] = effect_class("initial_phase")()
-    for name, effect in found.items():
-        for other in set(getattr(effect, "excludes", ())) & set(found):
-            faults.add("effects", f"list {name} and {other}: the same thing would count twice")
-        placed = getattr(effect, "placed", None)
-        if placed is not None:
-            try:
-                found[name] = placed(Path(faults.source).parent)
-            except RigError as error:
-                faults.add(f"effects.{name}", f"{error.what}: {error.value}")
-    return in_order(found.values())
+    return in_order(settled(found, Path(faults.source).parent, faults))
 
 
 def _check_exposure(exposure: Exposure, faults: Faults) -> None:
