@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spikerig.dataset.bayer import mosaic
 from spikerig.dataset.errors import NumericsError, UsageError
 from spikerig.dataset.kernels import fire
 from spikerig.dataset.sim_kernels import fire_noisy
@@ -122,15 +123,21 @@ def delayed(light: Floats, knots: NDArray[np.int64], by: NDArray[np.float64]) ->
 
 
 def spike_light(rgb: Floats, sensor: Sensor) -> Floats:
-    """Light as the spike pixels see it, in thresholds a tick: gain * (response . rgb), float32[K,H,W].
+    """Light as the spike pixels see it, in thresholds a tick, float32[K,H,W].
+
+    gain * (response . rgb); of a colour sensor gain * channel_gain * its own colour.
 
     Raises:
         NumericsError: a value is negative or not finite.
     """
-    k = np.array(sensor.response, np.float32) * np.float32(sensor.gain)
-    light = rgb[..., 0] * k[0]
-    light += rgb[..., 1] * k[1]
-    light += rgb[..., 2] * k[2]
+    if sensor.bayer is not None:
+        light = mosaic(rgb, sensor.bayer)
+        light *= np.float32(sensor.gain)
+    else:
+        k = np.array(sensor.response, np.float32) * np.float32(sensor.gain)
+        light = rgb[..., 0] * k[0]
+        light += rgb[..., 1] * k[1]
+        light += rgb[..., 2] * k[2]
     if not (np.min(light, initial=0) >= 0 and np.isfinite(np.max(light, initial=0))):
         bad = int(np.count_nonzero(~(light >= 0) | ~np.isfinite(light)))
         raise NumericsError("light must be finite and not negative", value=f"{bad} of {light.size} values are not")
