@@ -144,7 +144,7 @@ def with_dark(facts: Facts, effects: Sequence[Effect]) -> Facts:
     dark = np.zeros((1, height, width), np.float32)
     for effect in effects:
         hooks = effect.begin(site) if effect.stage == Stage.CHARGE else None
-        if hooks is not None and hooks.light is not None and not hooks.per_tick:
+        if hooks is not None and hooks.light is not None:
             hooks.light(dark)
     mean = float(dark.mean())
     return replace(facts, light=facts.light + mean, light_max=facts.light_max + mean) if mean > 0 else facts
