@@ -115,7 +115,8 @@ class _Block:
 
     def take(self, *effects: Effect) -> Taken:
         rig = replace(self.rig, effects=effects)
-        return take_blurry(rig, 0, "000", self.times, self.rgb[0], self.track, self.rgb)
+        arm = self.rgb if any(e.name == "misalignment" for e in effects) else None  # as if cast from its own pose
+        return take_blurry(rig, 0, "000", self.times, self.rgb[0], self.track, self.rgb, arm)
 
 
 def _block(rig: Rig, times: Schedule, light: Light, pixels: int) -> _Block:
@@ -190,6 +191,8 @@ def _effects(work: Work, light: Light, effects: Sequence[Effect], on: set[str]) 
         below = kept if effect.per == "tick" else []
         seconds = least(lambda block=block, below=below, effect=effect: block.take(*below, effect))
         found[effect.name] = work.train * max(seconds - bare[effect.per], 0.0) * scale / block.share
+        if effect.name == "misalignment":  # the RGB arm's pictures are cast as well
+            found[effect.name] += work.train * work.train_s
         if effect.per == "tick" and effect.name in on:
             kept.append(effect)
             bare["tick"] = seconds
