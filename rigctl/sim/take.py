@@ -116,17 +116,23 @@ def take_blurry(
         rgb: linear light float32[K,H,W,3] at `plan.phases`.
         arm: the same as the RGB arm sees it, where that differs.
     """
-    exposure = rig.exposure
     view, at_ns, path = _labelled(rig, number, name, plan, track, "train")
-    first = int(plan.knots[0])
-    t0_ns = start_ns(exposure, number) + round(first * exposure.tick_ns)
-    light = Light(rgb, plan.knots - first, (-first, exposure.ticks - first), exposure.rate_hz, t0_ns, arm)
+    light = light_of(rig, number, plan, rgb, arm)
     seen = simulate(light, rig.sensor, rig.effects, rig.seed, number, rig.camera, rig.events)
     error = seen.frame.pixels * (255 / seen.frame.full) - encode(sharp)
-    counts = count(seen.spikes.bits, rig.camera.width, -first, exposure.ticks - first)
+    counts = count(seen.spikes.bits, rig.camera.width, *light.exposure)
     blur_db = 20 * np.log10(255 / max(float(np.sqrt(np.mean(error**2))), 1e-9))
     view = replace(view, frame=seen.frame, spikes=seen.spikes, trajectory=path)
     return Taken(view, sharp, at_ns, path, NO_POINTS, blur_db, float(counts.mean()), int(counts.max()), seen.events)
+
+
+def light_of(
+    rig: Rig, number: int, plan: Schedule, rgb: NDArray[np.float32], arm: NDArray[np.float32] | None = None
+) -> Light:
+    """The light of a view over its spikes, from pictures at `plan.phases`; see `take_blurry`."""
+    exposure, first = rig.exposure, int(plan.knots[0])
+    t0_ns = start_ns(exposure, number) + round(first * exposure.tick_ns)
+    return Light(rgb, plan.knots - first, (-first, exposure.ticks - first), exposure.rate_hz, t0_ns, arm)
 
 
 def _labelled(
