@@ -43,6 +43,7 @@ class Work:
         once_s: CPU seconds of what is done once.
         train_s, test_s: of a view's pictures, cast or read.
         points: drawn from the views; 0 for none.
+        arm_s: of a view's pictures for an RGB camera that stands apart; 0 where none can be cast.
     """
 
     rig: Rig
@@ -53,6 +54,7 @@ class Work:
     train_s: float
     test_s: float
     points: int
+    arm_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,9 +115,9 @@ class _Block:
     rgb: NDArray[np.float32]
     share: float
 
-    def take(self, *effects: Effect) -> Taken:
+    def take(self, *effects: Effect, apart: bool = False) -> Taken:
         rig = replace(self.rig, effects=effects)
-        arm = self.rgb if any(e.name == "misalignment" for e in effects) else None  # as if cast from its own pose
+        arm = self.rgb if apart else None
         return take_blurry(rig, 0, "000", self.times, self.rgb[0], self.track, self.rgb, arm)
 
 
@@ -189,10 +191,11 @@ def _effects(work: Work, light: Light, effects: Sequence[Effect], on: set[str]) 
         if effect.per not in bare:
             bare[effect.per] = least(block.take)
         below = kept if effect.per == "tick" else []
-        seconds = least(lambda block=block, below=below, effect=effect: block.take(*below, effect))
+        apart = effect.name == "misalignment" and work.arm_s > 0
+        seconds = least(lambda b=block, e=(*below, effect), apart=apart: b.take(*e, apart=apart))
         found[effect.name] = work.train * max(seconds - bare[effect.per], 0.0) * scale / block.share
-        if effect.name == "misalignment":  # the RGB arm's pictures are cast as well
-            found[effect.name] += work.train * work.train_s
+        if apart:
+            found[effect.name] += work.train * work.arm_s
         if effect.per == "tick" and effect.name in on:
             kept.append(effect)
             bare["tick"] = seconds

@@ -49,4 +49,5 @@ def work_of(spec: SceneSpec, made: Plan) -> Work:
     test = path_s + look + picture * scale
     train = path_s + look + pictures * picture * scale + depth
     views = spec.orbit.views - len(held_out)
-    return Work(rig, views, len(held_out), times, max(once - picture, 0.0), train, test, spec.cloud.count)
+    arm = len(times.phases) * picture * scale
+    return Work(rig, views, len(held_out), times, max(once - picture, 0.0), train, test, spec.cloud.count, arm)

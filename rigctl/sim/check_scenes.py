@@ -11,18 +11,17 @@ from spikerig.rigctl.sim.effects import EFFECTS
 from spikerig.rigctl.sim.limits import nearest
 from spikerig.rigctl.sim.spec import SceneSpec, read_scene
 
-LEFT = {"sensor_map"}  # needs a file
-MARGIN_MS = 6.4
-
-# What the sensors do at their defaults, and (in scenes that say so) much less of it: so that there is something to
-# leave out, and something not to.
+# Scenes that say so take much less of an effect than its default: so that there is something to leave out, and
+# something not to. What is not listed is at its default there too.
 FAINT: Mapping[str, Mapping[str, Any]] = {
     "flicker": {"depth": 0.005},
     "brightness_ramp": {"per_s": 0.0002},
-    "splitter": {"share": 0.499},
-    "ghost": {"share": 0.002},
-    "vignetting": {},
-    "defocus": {},
+    "splitter": {"share": 0.4995},
+    "misalignment": {"rotation_deg": [0.003, -0.003, 0.003]},
+    "ghost": {"share": 0.0005},
+    "distortion": {"k1": -0.0002},
+    "defocus": {"radius_px": 0.05},
+    "vignetting": {"power": 0.02},
     "shot_noise": {"threshold_e": 50_000},
     "prnu": {"sd": 0.001},
     "dark_current": {"rate": 0.0001},
@@ -36,8 +35,18 @@ FAINT: Mapping[str, Mapping[str, Any]] = {
     "lost_blocks": {"chance": 1e-7},
     "clock_offset": {"offset_us": 5.0},
     "clock_jitter": {"sd_us": 1.0},
+    "clock_reset": {"jump_us": 10.0},
+    "rolling_shutter": {"readout_ms": 0.1},
+    "rgb_noise": {"full_well_e": 1e7, "read_e": 1.0},
+    "white_balance": {"gains": [1.001, 1.0, 0.999]},
     "read_noise": {"sd": 0.0003},
+    "jpeg": {"quality": 100, "colour": "4:4:4"},
 }
+# A file is coded in one way or none: a third of the scenes takes each.
+CODED = ({"jpeg"}, {"video_codec"}, {"bit_depth"})
+LEFT = {"sensor_map"}  # needs a file
+PLAIN = {"mirror_flip", "bayer", "response_curve", "video_codec", "bit_depth"}  # not faint, whatever they are set to
+MARGIN_MS = 6.4  # of a scene file's default
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,14 +151,19 @@ def table_of(case: Case, tolerance: tuple[float, float] = (1.0, 1.0)) -> dict[st
 
 
 def considered(case: Case, exposure: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """All effects that a scene can have without a file of its own, as a scene file would list them."""
+    """All effects that the scene can have at once, as a scene file would list them."""
+    files = set().union(*CODED) - CODED[CASES.index(case) % len(CODED)]
+    left = LEFT | files | (PLAIN if case.faint else set())
+    if exposure.get("phase") == "zero":
+        left = left | {"initial_phase"}
     rows = []
     for name in EFFECTS:
-        if name in LEFT or (name == "initial_phase" and exposure.get("phase") == "zero"):
+        if name in left:
             continue
         row = {"name": name, **(FAINT.get(name, {}) if case.faint else {})}
         if name == "rolling_shutter":  # its rows must lie within the margins
             margin_ms = MARGIN_MS if "margin_ticks" not in exposure else exposure["margin_ticks"] / 40
             row["readout_ms"] = 0.0 if exposure.get("protocol") == "paper" else min(7.0, 1.9 * margin_ms)
+            row["readout_ms"] = min(row["readout_ms"], FAINT[name]["readout_ms"]) if case.faint else row["readout_ms"]
         rows.append(row)
     return rows

@@ -7,7 +7,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from spikerig.dataset.errors import HostError
 from spikerig.dataset.kernels import count, fire
 from spikerig.rigctl.sim.calibrate import Costs, least, predict
-from spikerig.rigctl.sim.capture import capture, rig_of
+from spikerig.rigctl.sim.capture import capture, rgb_arm, rig_of
 from spikerig.rigctl.sim.casting import work_of
 from spikerig.rigctl.sim.check_scenes import Case, scene_of, table_of
 from spikerig.rigctl.sim.effects import Effect
@@ -54,19 +54,21 @@ def lights_of(spec: SceneSpec, views: int = SEEN) -> list[tuple[int, Light]]:
     found = []
     for number in spread([k for k in range(spec.orbit.views) if k not in held_out], views):
         times, path = schedule(timed(spec, number, stage)), view_path(spec, number)
-        rgb = np.stack([stage.picture(rig.camera, pose, spec.lens.samples) for pose in path.poses(times.phases)])
-        found.append((number, light_of(rig, number, times, rgb)))
+        poses = path.poses(times.phases)
+        rgb = np.stack([stage.picture(rig.camera, pose, spec.lens.samples) for pose in poses])
+        found.append((number, light_of(rig, number, times, rgb, rgb_arm(spec, stage, poses))))
     return found
 
 
 def outputs(spec: SceneSpec, lights: Sequence[tuple[int, Light]], effects: Sequence[Effect]) -> Outputs:
     """Simulate the views with some of the effects."""
-    rig = rig_of(spec)
+    rig, apart = rig_of(spec), any(effect.name == "misalignment" for effect in effects)
     counts, values = [], []
-    for number, light in lights:
+    for number, both in lights:
+        light = both if apart else replace(both, arm=None)
         seen = simulate(light, spec.sensor, effects, spec.seed, number, rig.camera)
         counts.append(count(seen.spikes.bits, rig.camera.width, *light.exposure))
-        values.append(seen.frame.pixels)
+        values.append(seen.frame.pixels8)
     return Outputs(np.stack(counts).astype(np.int64), np.stack(values).astype(np.int64))
 
 
