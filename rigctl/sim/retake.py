@@ -200,6 +200,4 @@ def _stretches(
     cuts = [a, *range((a // BLOCK + 1) * BLOCK, b, BLOCK), b]
     for first, stop in itertools.pairwise(cuts):
         ends = [before if hold else before + (after - before) * np.float32((t - a) / (b - a)) for t in (first, stop)]
-        if stop == b and not hold:
-            ends[1] = after
         yield np.stack(ends).astype(np.float32, copy=False), np.array([first, stop])
