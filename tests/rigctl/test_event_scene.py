@@ -19,7 +19,8 @@ from spikerig.rigctl.sim.effects import Hooks
 from spikerig.rigctl.sim.events import EventCamera, simulate_events
 from spikerig.rigctl.sim.sensor import Light, spike_light
 from spikerig.rigctl.sim.simulate import simulate
-from spikerig.rigctl.sim.spec import Sensor, read_scene
+from spikerig.rigctl.sim.spec import Exposure, Sensor, read_scene
+from spikerig.rigctl.sim.survey import Look, survey
 
 
 def smooth_light(seed: int = 0, height: int = 14, width: int = 19) -> Light:
@@ -155,6 +156,17 @@ def test_optics_act_before_colours_part() -> None:
     counts = np.unpackbits(spikes.bits, axis=2, bitorder="little")[:, :, :8].sum(0)
     assert (counts[::2, ::2] == 50).all()
     assert counts[::2, 1::2].sum() == counts[1::2].sum() == 0
+
+
+def test_a_survey_of_a_colour_sensor_looks_at_each_colour_apart() -> None:
+    """A steady red picture has no gradient for any of its pixels, though the mosaic is a checkerboard."""
+    rgb = np.zeros((2, 12, 16, 3), np.float32)
+    rgb[..., 0] = 0.5
+    look = Look(Light(rgb, np.array([0, 100]), (0, 100), 40_000.0), 1.0)
+    facts = survey([look], Sensor(colour="bayer"), Exposure(), focal_px=20.0, views=1)
+    assert facts.light.max() == pytest.approx(0.2)
+    assert not facts.gradient.any()
+    assert not facts.bend.any()
 
 
 def test_gray_is_what_it_was() -> None:
