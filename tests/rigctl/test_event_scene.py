@@ -12,6 +12,7 @@ from hard_store import same
 
 from spikerig.dataset.bayer import Bayer, bayer_of, demosaic
 from spikerig.dataset.errors import UsageError
+from spikerig.dataset.images import write_image
 from spikerig.dataset.store import open_scene, verify_scene
 from spikerig.dataset.texture import tfp
 from spikerig.rigctl.sim.capture import capture, rig_of, take_view
@@ -89,6 +90,26 @@ def test_a_captured_scene_holds_its_events(tmp_path: Path) -> None:
         assert 0 < len(events) < len(file.events("000"))
         assert file.info["events"]["threshold_pos"] == 0.3
         assert file.info["scene_file"]["events"]["noise_hz"] == 2.0
+
+
+def test_pictures_from_elsewhere_have_events_too(tmp_path: Path) -> None:
+    from spikerig.rigctl.sim.folder import read_folder
+    from spikerig.rigctl.sim.frames import capture_folder
+
+    frames = []
+    for k in range(3):
+        write_image(tmp_path / f"{k}.exr", np.full((6, 8, 3), [0.1, 0.8, 0.2][k], np.float32))
+        frames.append({"file": f"{k}.exr", "transform_matrix": np.eye(4).tolist()})
+    (tmp_path / "transforms.json").write_text(
+        json.dumps({"camera_angle_x": 1.0, "views": [{"name": "a", "frames": frames}]})
+    )
+    (tmp_path / "capture.toml").write_text("[exposure]\nexposure_ms = 1\n[events]\nthreshold_pos = 0.5\neps = 1e-9\n")
+    told = capture_folder(read_folder(tmp_path), tmp_path / "s.h5")
+    with open_scene(tmp_path / "s.h5") as file:
+        seen = file.events("a")
+    up = int(np.log(8) / 0.5)  # 4, to a level of 2 above the start; the end lies log 2 above it
+    assert told["events"] == len(seen) == 48 * (up + int((up * 0.5 - np.log(2)) / 0.2))
+    assert (np.diff(seen.t_ns)[seen.polarity[1:] != seen.polarity[:-1]] > 0).all()
 
 
 def test_workers_give_the_same_events(tmp_path: Path) -> None:
