@@ -52,6 +52,15 @@ def test_events_see_the_spikes_light() -> None:
         assert seen.spikes.t0_ns == seen.events.t0_ns
 
 
+def test_noise_is_another_in_each_view() -> None:
+    light, noisy = smooth_light(), EventCamera(noise_hz=1e4)
+    one, two, again = (simulate(light, Sensor(), [], 3, view, events=noisy).events for view in (1, 2, 1))
+    assert one is not None
+    assert two is not None
+    same(one, again)
+    assert one.t_ns.tolist() != two.t_ns.tolist()
+
+
 class Dimmer:
     """Optics that halve the light, and a lamp that flickers before the arms part."""
 
@@ -198,7 +207,7 @@ def test_gray_is_what_it_was() -> None:
 
 
 def test_a_colour_scene_says_so_and_gives_its_colours_back(tmp_path: Path) -> None:
-    table = {"colour": "bayer", "pattern": "gbrg", "channel_gain": [1.5, 1.0, 2.0], "gain": 0.3}
+    table = {"colour": "bayer", "pattern": "gbrg", "channel_gain": [1.5, 1.0, 2.0], "gain": 0.3, "response": [1, 1, 1]}
     spec = small(sensor=table, shake__path_px=[0, 0], effects=[], exposure__exposure_ms=40.0, exposure__period_ms=100.0)
     assert rig_of(spec).light_gain == 0.3
     capture(spec, tmp_path / "s.h5")
