@@ -178,7 +178,11 @@ def read_linear(
         colour = np.repeat(colour, 3, axis=2)
     if colour.shape[2] == 4:
         if background is None:
-            raise UsageError("the picture has alpha: say what lies behind it", value=path, next="give a background")
+            raise UsageError(
+                "the picture has alpha: say what lies behind it",
+                value=path,
+                next="give a background (--background 1; of a folder: background in transforms.json)",
+            )
         alpha, colour = colour[:, :, 3:], colour[:, :, :3]
         behind = background if linear else float(srgb_from_linear(background))
         colour = colour * (1 if linear else alpha) + behind * (1 - alpha)

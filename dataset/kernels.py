@@ -127,7 +127,13 @@ def tfi_all(bits: Bits, width: int) -> NDArray[np.uint16]:
 
 
 def fire(
-    light: NDArray[np.float32], knots: NDArray[np.int64], charge: NDArray, *, hold: bool, carry: bool = False
+    light: NDArray[np.float32],
+    knots: NDArray[np.int64],
+    charge: NDArray,
+    *,
+    hold: bool,
+    span: tuple[int, int] | None = None,
+    carry: bool = False,
 ) -> tuple[Bits, NDArray, NDArray[np.float64]]:
     """Integrate light and fire a spike at every threshold.
 
@@ -138,11 +144,13 @@ def fire(
             knots (or K: then the last light row is not used).
         charge: uint32[H,W] at the start, in 2^-32 of a threshold; with `carry` also int64. It is left as it is.
         hold: steps instead of ramps.
+        span: ticks to run, [first, end) within the knots; None: all. Spans that follow each other, each with the charge
+            the last one left, give the bits of all, wherever they part.
         carry: what a tick brings beyond one spike waits, and fires in the ticks after.
 
     Returns:
         (bits uint8[T,H,ceil(W/8)], charge at the end: uint32[H,W], with `carry` int64[H,W], whole thresholds above the
-        low 32 bits; clipped float64[H,W] in thresholds), with T = knots[-1] - knots[0].
+        low 32 bits; clipped float64[H,W] in thresholds), with T the ticks of the span.
 
     Raises:
         NumericsError: light is negative, not finite, or above 2^18 thresholds a tick.
@@ -161,21 +169,21 @@ def fire(
     Source:
         Integrate-and-fire with the surplus kept, Eq. 5-6 of the paper; definition in `oracles.fire`.
     """
-    light, knots = checked_light(light, knots, charge, hold=hold)
+    light, knots, (first, end) = checked_light(light, knots, charge, hold=hold, span=span)
     if charge.dtype != np.uint32 and not (carry and charge.dtype == np.int64):
         raise UsageError("charge is uint32, in 2^-32 of a threshold (with `carry` also int64)", value=charge.dtype)
     left = checked_charge(charge, low=0)
     height, width = light.shape[1:]
-    bits = np.empty((int(knots[-1] - knots[0]), height, (width + 7) // 8), np.uint8)
+    bits = np.empty((end - first, height, (width + 7) // 8), np.uint8)
     clipped = np.empty((height, width), np.float64)
-    _native.fire(light, knots, hold, carry, left, bits, clipped)
+    _native.fire(light, knots, hold, first, carry, left, bits, clipped)
     return bits, left if carry else left.astype(np.uint32), clipped
 
 
 def checked_light(
-    light: NDArray[np.float32], knots: NDArray[np.int64], charge: NDArray, *, hold: bool
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Light and knots as the native side takes them, or the faults that `fire` lists."""
+    light: NDArray[np.float32], knots: NDArray[np.int64], charge: NDArray, *, hold: bool, span: tuple[int, int] | None
+) -> tuple[NDArray[np.float32], NDArray[np.int64], tuple[int, int]]:
+    """Light, knots and span as the native side takes them, or the faults that `fire` lists."""
     light = np.ascontiguousarray(light, np.float32)
     knots = np.ascontiguousarray(knots, np.int64)
     if light.ndim != 3 or knots.ndim != 1 or charge.shape != light.shape[1:] or light.shape[2] < 1:
@@ -198,7 +206,10 @@ def checked_light(
                 expected=f"0 .. {MAX_LIGHT:.0f}",
                 cause="a division by zero, or light in other units than thresholds a tick",
             )
-    return light, knots
+    first, end = (int(knots[0]), int(knots[-1])) if span is None else span
+    if not knots[0] <= first <= end <= knots[-1]:
+        raise UsageError("a span must lie within the knots", value=span, expected=f"{knots[0]} .. {knots[-1]}")
+    return light, knots, (first, end)
 
 
 def checked_charge(charge: NDArray, *, low: int) -> NDArray[np.int64]:
