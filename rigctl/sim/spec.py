@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from spikerig.dataset.bayer import PATTERNS, Bayer
-from spikerig.dataset.errors import RigError, UsageError
+from spikerig.dataset.errors import UsageError
 from spikerig.rigctl.sim.effects import Effect, effect_class, in_order, read_effects, settled
 from spikerig.rigctl.sim.events import EventCamera
 from spikerig.rigctl.sim.limits import Faults, limits, nearest, read_record
