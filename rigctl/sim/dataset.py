@@ -16,9 +16,10 @@ from typing import Any
 from spikerig.dataset import machine
 from spikerig.dataset.errors import DataError, HostError, UsageError
 from spikerig.dataset.terminal import jsonable
-from spikerig.rigctl.sim.capture import provenance, rig_of
+from spikerig.rigctl.sim.capture import provenance, rig_of, settled
 from spikerig.rigctl.sim.farm import Cluster, fill, finished
 from spikerig.rigctl.sim.limits import nearest
+from spikerig.rigctl.sim.plan import Plan
 from spikerig.rigctl.sim.sheet import contact_sheet, overview
 from spikerig.rigctl.sim.shelf import Shelf, alone, differences, fingerprint, write_whole
 from spikerig.rigctl.sim.spec import SceneSpec, builtin_names, load_scene_toml, with_changes
@@ -118,6 +119,7 @@ def make(
             if name in kept:
                 continue
             started = time.monotonic(), _cpu_seconds()
+            spec, judged = settled(spec)
             shelf = Shelf(folder / f"{name}.views", made, force)
             lacking = len(shelf.missing(spec.orbit.views))
             done = begin(name, spec.orbit.views, spec.orbit.views - lacking)
@@ -125,7 +127,7 @@ def make(
                 cluster.fill(spec, shelf, done)
             else:
                 fill(spec, shelf, workers, done)
-            document["scenes"][name] = _seal(folder, spec, shelf)
+            document["scenes"][name] = _seal(folder, spec, shelf, judged)
             document["runs"].append(
                 {
                     "scene": name,
@@ -267,10 +269,10 @@ def _check_space(folder: Path, specs: Sequence[SceneSpec]) -> None:
         )
 
 
-def _seal(folder: Path, spec: SceneSpec, shelf: Shelf) -> dict[str, Any]:
+def _seal(folder: Path, spec: SceneSpec, shelf: Shelf, judged: Plan | None) -> dict[str, Any]:
     """Gather the finished views of a scene in its file, beside it a contact sheet; its row of the manifest."""
     path = folder / f"{spec.name}.h5"
-    info = {**provenance(spec), "made_by": "spikerig sim dataset"}
+    info = {**provenance(spec, judged), "made_by": "spikerig sim dataset"}
     told = pack(path, rig_of(spec), finished(spec, shelf), info=info, views=spec.orbit.views, force=True)
     sheet = folder / f"{spec.name}.png"
     contact_sheet(sheet, path)

@@ -8,6 +8,7 @@ import re
 from typing import Any
 
 from spikerig.rigctl.sim.effects import EFFECTS, effect_class
+from spikerig.rigctl.sim.events import EventCamera
 from spikerig.rigctl.sim.orbit import Orbit
 from spikerig.rigctl.sim.pattern import Texture
 from spikerig.rigctl.sim.spec import PAPER, Cloud, Exposure, Lens, RgbCamera, Sensor, Shake, Tolerance
@@ -20,6 +21,7 @@ TABLES: tuple[tuple[str, type], ...] = (
     ("exposure", Exposure),
     ("sensor", Sensor),
     ("rgb", RgbCamera),
+    ("events", EventCamera),
     ("tolerance", Tolerance),
     ("points", Cloud),
     ("world.lamp", Lamp),
@@ -54,7 +56,10 @@ def page() -> str:
     parts.append(
         f"### Textures: `texture`, `floor`, `ceiling`, `walls`, `bark`, `leaf`\n\n{_about(Texture)}{_rows(Texture)}"
     )
-    parts.append("## Effects\n\nThey act in this order. Each draws from its own random stream of (seed, name, view).\n")
+    parts.append(
+        "## Effects\n\nThey act in this order. Each draws from its own random stream of (seed, name, view).\n"
+        "Blur by motion is none of them: it is the exposure itself, `[exposure]` and `[shake]`.\n"
+    )
     for name in EFFECTS:
         effect: Any = effect_class(name)
         parts.append(
