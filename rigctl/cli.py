@@ -76,6 +76,8 @@ def tell(schema: str, out: Path, told: dict[str, Any], began: float, as_json: bo
     told = {"out": str(out), **told, "seconds": time.monotonic() - began}
     if as_json:
         emit(schema, told)
+    if "plan_line" in told:
+        note(told["plan_line"])
     blur = f", blurry pictures {told['blurry_psnr_db']:.2f} dB from sharp" if told["train_views"] else ""
     note(
         f"{out}: {told['train_views']} train and {told['test_views']} test views of {told['size'][0]}x"
