@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from spikerig.dataset import cost
+from spikerig.dataset.errors import UsageError
 from spikerig.dataset.texture_cost import finish
 
 if TYPE_CHECKING:
@@ -21,11 +22,21 @@ SUB_POSES = (2, 3, 5, 9, 18, 33, 65)
 REFERENCE = 321
 SAMPLES = (1, 2, 3, 4, 6)
 FINEST = 12
+KINDS = {  # what is swept: name of the sweep, its title, its knob, what errors are held against
+    "light": (
+        "sim",
+        "light samples",
+        "samples",
+        f"float64 sums over every tick of {REFERENCE} sub-poses (or one a tick); {FINEST}x{FINEST} rays a pixel",
+    ),
+    "arithmetic": ("sim_arithmetic", "arithmetic", "arithmetic", "extended-precision sums of the same light"),
+    "effects": ("sim_effects", "effects", "effect", "the same light without any effect"),
+}
 DIM_TICKS, DIM_LIGHT = 1_000_000, 0.01  # thresholds a tick, with half of it either way
 
 
-def settings(scene: str, view: int) -> list[cost.Setting]:
-    """Sub-poses an exposure, rays a pixel, arithmetic, and each effect of the scene."""
+def settings(scene: str, view: int, what: str) -> list[cost.Setting]:
+    """Of one kind: `light` (sub-poses an exposure, rays a pixel), `arithmetic`, or `effects` of the scene."""
     from spikerig.rigctl.sim.spec import load_scene_toml
 
     whole = load_scene_toml(scene)
@@ -37,14 +48,13 @@ def settings(scene: str, view: int) -> list[cost.Setting]:
         lens=replace(whole.lens, samples=1),
         exposure=replace(whole.exposure, margin_ticks=0),
     )
+    if what == "light":
+        finest = light_of(spec, view, min(REFERENCE, most_pictures(spec)))
+        return [*step_settings(spec, view, finest), *ray_settings(spec, view)]
     light = light_of(spec, view, spec.exposure.sub_poses)
-    return [
-        *step_settings(spec, view, light_of(spec, view, min(REFERENCE, most_pictures(spec)))),
-        *ray_settings(spec, view),
-        *arithmetic_settings(light, spec.sensor),
-        *dim_settings(),
-        *effect_settings(light, spec.sensor, whole.effects, spec.seed, view),
-    ]
+    if what == "arithmetic":
+        return [*arithmetic_settings(light, spec.sensor), *dim_settings()]
+    return effect_settings(light, spec.sensor, whole.effects, spec.seed, view)
 
 
 def most_pictures(spec: SceneSpec) -> int:
@@ -243,22 +253,25 @@ def effect_settings(
 def sim(
     scene: Annotated[str, typer.Option(help="A scene file, or the name of a built-in one.")] = "demo",
     view: Annotated[int, typer.Option(help="Which view to simulate.")] = 0,
+    what: Annotated[str, typer.Option(help="light, arithmetic or effects.")] = "light",
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for NAME.json and NAME.svg.")] = None,
     repeats: Annotated[int, typer.Option(help="Timed runs of each setting.")] = 3,
     force: Annotated[bool, typer.Option("--force", help="Replace an earlier result.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
 ) -> None:
-    """Sweep light samples, rays, arithmetic and effects: error against a far finer setting over seconds."""
+    """Sweep light samples and rays, arithmetic, or effects: error against a far finer setting over seconds."""
+    if what not in KINDS:
+        raise UsageError("unknown kind of sweep", value=what, expected=", ".join(KINDS))
+    name, title, knob, reference = KINDS[what]
     finish(
-        "sim",
+        name,
         lambda: cost.sweep(
-            "sim",
-            f"Simulating a view of '{scene}'",
-            settings(scene, view),
-            knob="samples, arithmetic or effect",
+            name,
+            f"Simulating a view of '{scene}': {title}",
+            settings(scene, view, what),
+            knob=knob,
             error_unit="see series",
-            reference=f"float64 sums over every tick of {REFERENCE} sub-poses (or one a tick); {FINEST}x{FINEST} rays "
-            "a pixel; extended sums of the same light; no effect",
+            reference=reference,
             repeats=repeats,
         ),
         out,

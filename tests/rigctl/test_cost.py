@@ -1,11 +1,13 @@
 """`spikerig cost sim`: its sweeps measure what they say."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hard_sim import small
 
+from spikerig.dataset.cli import run
 from spikerig.dataset.cost import Setting
 from spikerig.rigctl.cost import (
     arithmetic_settings,
@@ -79,3 +81,16 @@ def test_a_setting_for_each_effect_and_output_it_reaches() -> None:
     assert spikes.pop("none") == frame.pop("none") == 0
     assert min(spikes.values()) > 0
     assert frame["read_noise"] == pytest.approx(255 * spec.effects[-1].sd, rel=0.5)  # type: ignore[attr-defined]
+
+
+def test_an_unknown_kind(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["cost", "sim", "--what", "tea"]) == 2
+    assert "light, arithmetic, effects" in capsys.readouterr().err
+
+
+def test_effects_of_a_scene_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["cost", "sim", "--scene", "chroma", "--what", "effects", "--repeats", "1", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["name"] == "sim_effects"
+    assert document["rows"][0]["value"] == "none"
+    assert document["rows"][0]["error"] == 0
