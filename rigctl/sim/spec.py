@@ -8,20 +8,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from spikerig.dataset.bayer import PATTERNS, Bayer
 from spikerig.dataset.errors import UsageError
 from spikerig.rigctl.sim.effects import Effect, effect_class, in_order, read_effects, settled
+from spikerig.rigctl.sim.events import EventCamera
 from spikerig.rigctl.sim.limits import Faults, limits, nearest, read_record
 from spikerig.rigctl.sim.orbit import Orbit, orbit_pose
 from spikerig.rigctl.sim.presets import PRESETS, preset_effects, preset_names
 from spikerig.rigctl.sim.world import Vec3, World, read_world, stands_in
-
-if TYPE_CHECKING:
-    from spikerig.rigctl.sim.events import EventCamera
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,15 +276,8 @@ def _settings(top: _Top, faults: Faults) -> Settings:
         if isinstance(top.sensor, Mapping) and name in top.sensor:
             faults.add(f"sensor.{name}", 'is for colour = "bayer"; this sensor sees gray')
     auto = tolerance if top.effects == "auto" else None
-    return Settings(top.name, top.seed, exposure, sensor, cloud, effects, rgb, auto, _event_camera(top.events, faults))
-
-
-def _event_camera(table: Any, faults: Faults) -> EventCamera | None:
-    if table is None:
-        return None
-    from spikerig.rigctl.sim.events import EventCamera
-
-    return read_record(EventCamera, table, "events", faults)
+    events = None if top.events is None else read_record(EventCamera, top.events, "events", faults)
+    return Settings(top.name, top.seed, exposure, sensor, cloud, effects, rgb, auto, events)
 
 
 def _sensor_defaults(table: Any, paper: bool) -> Mapping[str, Any]:
