@@ -1,4 +1,4 @@
-"""COLMAP, in a process of its own: `python -m spikerig.calib.colmap_child JOB.json`; the only module that imports pycolmap.
+"""COLMAP, in a process of its own: `python -m spikerig.calib.colmap_child JOB.json`; only this imports pycolmap.
 
 Its wheel exports a static zlib (after it is imported first, PNG writing aborts) and ends the process when asked for a
 feature type it was built without. So the parent never imports it: a job comes as JSON, a result goes back as JSON and

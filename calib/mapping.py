@@ -225,7 +225,6 @@ def _map_of(told: dict[str, Any], root: Path, names: Mapping[str, str]) -> Map:
         names[n]: Placed(np.array(r["pose"]), r["inliers"], np.array(r["cov"]))
         for n, r in told.get("placed", {}).items()
     }
-    arrays = [np.load(root / f"{key}.npy", allow_pickle=False) for key in ("xyz", "rgb", "error")]
-    return Map(
-        poses, placed, *arrays, told["error_px"], tuple(told["models"]), told["seconds"], told["version"], told["cameras"]
-    )
+    xyz, rgb, error = (np.load(root / f"{key}.npy", allow_pickle=False) for key in ("xyz", "rgb", "error"))
+    more = told["error_px"], tuple(told["models"]), told["seconds"], told["version"], told["cameras"]
+    return Map(poses, placed, xyz, rgb, error, *more)

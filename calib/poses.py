@@ -9,16 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.calib.gauge import centres, extent, pose_errors, similarity
+from spikerig.calib.consensus import Path, agree, apart_by, averaged, paths_through
+from spikerig.calib.gauge import centres, extent
 from spikerig.calib.mapping import Map, Options, build_map
 from spikerig.calib.pictures import KINDS, Looks, looks, picture_of, texture_of
-from spikerig.calib.smooth import compose, mean_pose, smooth_path
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.scene import Camera, View
 
 Floats = NDArray[np.float64]
 LOOKED_AT = 6  # views on which the kinds of texture are judged
-AGREE_DEG, AGREE_SHARE = 1.5, 0.03  # median rotation, and median distance over the extent, within which maps agree
 HARDER = Options(peak_threshold=0.0015, max_ratio=0.85)
 
 
@@ -46,17 +45,9 @@ class Wanted:
         if self.arms not in ("spike", "rgb", "both"):
             raise UsageError("unknown arms", value=self.arms, expected="spike, rgb or both")
         if not (1 <= self.maps <= 8 and 1 <= self.instants <= 101 and 0 < self.min_share <= 1):
-            raise UsageError("maps, instants or min_share out of range", value=(self.maps, self.instants, self.min_share))
-
-
-@dataclass(frozen=True, slots=True)
-class Path:
-    """A view's poses over its exposure: phases float64[M], cam_from_world [M,3,4], covariances [M,6,6], chi-square."""
-
-    phases: Floats
-    poses: Floats
-    cov: Floats
-    chi2: float
+            raise UsageError(
+                "maps, instants or min_share out of range", value=(self.maps, self.instants, self.min_share)
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +118,7 @@ def estimate_poses(
     if wanted.arms == "rgb":
         pictures = {v.name: v.frame.pixels for v in usable}
         found = build_map(pictures, rgb_camera or camera, options, keep=keep, done=done)
-        return _judged(Estimate(names, _poses(found), {}, found, ("rgb",)), wanted)
+        return _judged(Estimate(names, {n: p.pose for n, p in found.poses.items()}, {}, found, ("rgb",)), wanted)
     ranked = _ranked(usable, wanted)
     kinds = wanted.kinds or tuple(look.kind for look in ranked)
     rigged = _Rigged(usable, camera, wanted, options, rgb_camera or camera, spike_from_rgb, keep, done)
@@ -166,13 +157,13 @@ class _Rigged:
     def map(self, kind: str, first: bool = False) -> Map:
         """Map the middle instants by one kind of texture; the first map also takes the further instants."""
         folder = "spike/" if self.wanted.arms == "both" else ""
-        pictures = {f"{folder}{v.name}": picture_of(texture_of(v.spikes, tick_at(v, 0.5), kind)) for v in self.views}
+        pictures = {f"{folder}{v.name}": look_at(v, 0.5, kind) for v in self.views}
         further = {}
         if first and self.wanted.instants > 1:
             for v in self.views:
                 for k, phase in enumerate(self.phases):
                     if abs(phase - 0.5) > 1e-9:
-                        picture = picture_of(texture_of(v.spikes, tick_at(v, phase), kind))
+                        picture = look_at(v, phase, kind)
                         further[f"{folder}{v.name}.at{k:03d}"] = (f"{folder}{v.name}", picture)
         rig = None
         if self.wanted.arms == "both":
@@ -197,10 +188,14 @@ def rig_config(spike: Camera, rgb: Camera, spike_from_rgb: Floats | None) -> lis
     from spikerig.calib.mapping import colmap_camera
 
     pose = np.eye(3, 4) if spike_from_rgb is None else spike_from_rgb
-    rows = []
+    rows: list[dict[str, Any]] = []
     for name, camera in (("spike/", spike), ("rgb/", rgb)):
         model = colmap_camera(camera)
-        row = {"image_prefix": name, "camera_model_name": model["model"], "camera_params": list(map(float, model["params"]))}
+        row = {
+            "image_prefix": name,
+            "camera_model_name": model["model"],
+            "camera_params": list(map(float, model["params"])),
+        }
         if name == "spike/":
             row["ref_sensor"] = True
         else:
@@ -226,6 +221,13 @@ def quaternion(R: Floats) -> Floats:
     return q if q[0] >= 0 else -q
 
 
+def look_at(view: View, phase: float, kind: str) -> NDArray[np.uint8]:
+    """The picture of a view by a kind of texture, at a phase of the exposure."""
+    if view.spikes is None:
+        raise UsageError("this view has no spikes", value=view.name)
+    return picture_of(texture_of(view.spikes, tick_at(view, phase), kind))
+
+
 def tick_at(view: View, phase: float) -> float:
     """The tick of the view's spikes at a phase of the middle row's exposure (0 its start, 1 its end)."""
     frame, spikes = view.frame, view.spikes
@@ -241,36 +243,39 @@ def _ranked(views: Sequence[View], wanted: Wanted) -> tuple[Looks, ...]:
     found = []
     for kind in wanted.kinds or KINDS:
         try:
-            found.append(looks([picture_of(texture_of(v.spikes, tick_at(v, 0.5), kind)) for v in some], kind))
+            found.append(looks([look_at(v, 0.5, kind) for v in some], kind))
         except UsageError:
             if wanted.kinds:
                 raise
     if not found:
-        raise UsageError("the spikes are too short for any texture", value=f"{some[0].spikes.ticks} ticks")
+        raise UsageError("the spikes are too short for any texture", expected="windows of 48 ticks and more")
     return tuple(sorted(found, key=lambda look: -look.score))
-
-
-def _poses(found: Map) -> dict[str, Floats]:
-    return {name: placed.pose for name, placed in found.poses.items()}
 
 
 def _arm(found: Map, folder: str) -> Map:
     """The pictures of one arm, their folder taken off their names."""
-    mine = [{n.removeprefix(folder): p for n, p in rows.items() if n.startswith(folder)} for rows in (found.poses, found.placed)]
-    return replace(found, poses=mine[0], placed=mine[1])
+
+    def mine(rows: Mapping[str, Any]) -> dict[str, Any]:
+        return {n.removeprefix(folder): p for n, p in rows.items() if n.startswith(folder)}
+
+    return replace(found, poses=mine(found.poses), placed=mine(found.placed))
 
 
 def _settled(rigged: _Rigged, maps: Mapping[str, Map], names: tuple[str, ...], ranked: tuple[Looks, ...]) -> Estimate:
     """The largest group of maps that agree: its best map, poses averaged over the group, paths through its instants."""
-    apart = {(a, b): _apart(maps[a], maps[b]) for a in maps for b in maps if a != b}
-    friends = {a: [a] + [b for b in maps if b != a and _agree(apart[a, b])] for a in maps}
+    apart = {(a, b): apart_by(maps[a], maps[b]) for a in maps for b in maps if a != b}
+    friends = {a: [a] + [b for b in maps if b != a and agree(apart[a, b])] for a in maps}
     order = list(maps)
     best = max(order, key=lambda k: (len(friends[k]), len(maps[k].poses), -order.index(k)))
     group = friends[best]
-    poses = _averaged([maps[k] for k in group])
+    poses = averaged([maps[k] for k in group])
     pairs = [apart[best, k] for k in group[1:]]
     first = maps[order[0]]
-    paths = _paths(first, maps[best], poses, rigged.phases) if rigged.wanted.instants > 1 and order[0] in group else {}
+    paths = (
+        paths_through(first, maps[best], poses, rigged.phases)
+        if rigged.wanted.instants > 1 and order[0] in group
+        else {}
+    )
     kinds = (best, *(k for k in order if k != best))
     seconds: dict[str, float] = {}
     for found in maps.values():
@@ -291,64 +296,6 @@ def _settled(rigged: _Rigged, maps: Mapping[str, Map], names: tuple[str, ...], r
     )
 
 
-def _apart(a: Map, b: Map) -> tuple[float, float]:
-    """Median rotation (degrees) and distance (share of the extent) between two maps' poses of the same views."""
-    shared = sorted(a.poses.keys() & b.poses.keys())
-    if len(shared) < 3:
-        return np.inf, np.inf
-    stacks = [np.stack([m.poses[n].pose for n in shared]) for m in (a, b)]
-    if extent(stacks[0]) <= 0 or extent(stacks[1]) <= 0:
-        return np.inf, np.inf
-    turned, moved = pose_errors(*stacks)
-    return float(np.median(turned)), float(np.median(moved))
-
-
-def _agree(apart: tuple[float, float]) -> bool:
-    return apart[0] <= AGREE_DEG and apart[1] <= AGREE_SHARE
-
-
-def _averaged(maps: Sequence[Map]) -> dict[str, Floats]:
-    """Poses in the first map's world, averaged over all maps that have them: their errors differ."""
-    stacks = [_poses(maps[0])]
-    for other in maps[1:]:
-        shared = sorted(maps[0].poses.keys() & other.poses.keys())
-        to = similarity(*(np.stack([m.poses[n].pose for n in shared]) for m in (other, maps[0])))
-        moved = to.poses(np.stack([p.pose for p in other.poses.values()]))
-        stacks.append(dict(zip(other.poses, moved, strict=True)))
-    return {name: mean_pose([s[name] for s in stacks if name in s]) for name in stacks[0]}
-
-
-def _paths(first: Map, best: Map, poses: Mapping[str, Floats], phases: Floats) -> dict[str, Path]:
-    """Paths over the exposures, moved so that each goes through its view's averaged pose at the middle."""
-    to = None
-    if first is not best:
-        shared = sorted(first.poses.keys() & best.poses.keys())
-        to = similarity(*(np.stack([m.poses[n].pose for n in shared]) for m in (first, best)))
-    paths = {}
-    for name in poses.keys() & first.poses.keys():
-        rows = [(0.5, first.poses[name].pose, None)]
-        rows += [
-            (phases[k], first.placed[key].pose, first.placed[key].cov)
-            for k in range(len(phases))
-            if (key := f"{name}.at{k:03d}") in first.placed
-        ]
-        if len(rows) < 3:
-            continue
-        at, measured = np.array([r[0] for r in rows]), np.stack([r[1] for r in rows])
-        known = np.array([np.sqrt(np.maximum(np.diag(c), 0)) for _, _, c in rows[1:]])
-        sigmas = np.concatenate([np.median(known, 0)[None], known])
-        scale = 1.0
-        if to is not None:
-            measured, scale = to.poses(measured), to.scale
-        sigmas[:, 3:] *= scale
-        smooth, cov, chi2 = smooth_path(at, measured, sigmas, np.append(phases, 0.5))
-        inverse = np.concatenate([smooth[-1][:, :3].T, -(smooth[-1][:, :3].T @ smooth[-1][:, 3])[:, None]], 1)
-        shift = compose(inverse, poses[name])  # world of the path -> world of the average, in the middle
-        moved = np.stack([compose(p, shift) for p in smooth[:-1]])
-        paths[name] = Path(phases, moved, cov[:-1], chi2)
-    return paths
-
-
 def _judged(found: Estimate, wanted: Wanted) -> Estimate:
     """The estimate with the reasons against it."""
     reasons = []
@@ -359,7 +306,7 @@ def _judged(found: Estimate, wanted: Wanted) -> Estimate:
     if placed and not found.best.error_px <= wanted.max_error_px:
         reasons.append(f"the mean residual is {found.best.error_px:.2f} px, more than {wanted.max_error_px:g}")
     if found.agreeing[1] > 1 and found.agreeing[0] < 2:
-        reasons.append(f"{found.agreeing[1]} kinds of texture give {found.agreeing[1]} different maps: none is to be trusted")
+        reasons.append(f"{found.agreeing[1]} kinds of texture give maps that differ: none is to be trusted")
     if placed >= 3:
         stack = np.stack(list(found.poses.values()))
         depth = _depth(found.best, stack)

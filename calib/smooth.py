@@ -46,8 +46,9 @@ def smooth_path(
     for axis in range(6):
         sigma = np.maximum(sigmas[:, axis], 1e-9)
         weight = 1 / sigma
+        solved, off = np.zeros(degree + 1), np.zeros(len(at))
         for _ in range(5):
-            solved, *_ = np.linalg.lstsq(basis * weight[:, None], local[:, axis] * weight, rcond=None)
+            solved = np.linalg.lstsq(basis * weight[:, None], local[:, axis] * weight, rcond=None)[0]
             off = np.abs(basis @ solved - local[:, axis]) / sigma
             weight = np.sqrt(np.minimum(1, HUBER / np.maximum(off, 1e-12))) / sigma
         free = max(len(at) - degree - 1, 1)
