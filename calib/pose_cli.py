@@ -115,9 +115,8 @@ def _folder(source: Path, out: Path | None, options: Any, shared: bool, min_shar
     keep = None if out is None else out / "colmap"
     pictures = {p.stem: p for p in files}
     tuned = replace(options, max_error_px=max(options.max_error_px, 4.0))  # COLMAP's own, for pictures of any size
-    found = build_map(
-        pictures, None, tuned, separate_cameras=not shared, keep=keep, done=lambda step: bar.step(1, step)
-    )
+    more = {"separate_cameras": not shared, "keep": keep}
+    found = build_map(pictures, None, tuned, **more, done=lambda step: bar.step(1, step))
     poses = {n: p.pose for n, p in found.poses.items()}
     reasons = ()
     if len(poses) < max(3, min_share * len(files)):
