@@ -194,7 +194,7 @@ def _place(job: dict[str, Any], root: Path, database: Path, model: Any) -> dict[
     options.ransac.random_seed = job["seed"]
     placed = {}
     for name in job["place"]:
-        image = opened.read_image_with_name(name)
+        image: Any = opened.read_image_with_name(name)
         keys = np.asarray(opened.read_keypoints(image.image_id), np.float64)[:, :2]
         found: dict[tuple[int, int], None] = {}
         for other in near.get(own[name], []):

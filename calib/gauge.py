@@ -57,7 +57,7 @@ def similarity(source: Floats, target: Floats) -> Similarity:
     spread = [float(np.sqrt(np.mean(np.sum((c - c.mean(0)) ** 2, 1)))) if len(c) else 0.0 for c in (here, there)]
     if len(here) < 2 or min(spread) <= 1e-12:
         raise DataError("a scale needs cameras at two places at least", value=f"{len(here)} cameras, spread {spread}")
-    ratio = spread[1] / spread[0]
+    found, ratio = Similarity(1.0, np.eye(3), np.zeros(3)), spread[1] / spread[0]
     for _ in range(4):  # the axes' length in the source is the target's over the scale: converges at once
         a = np.concatenate([here, *(here + spread[1] / ratio * source[:, k, :3] for k in range(3))])
         b = np.concatenate([there, *(there + spread[1] * target[:, k, :3] for k in range(3))])

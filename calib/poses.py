@@ -271,11 +271,8 @@ def _settled(rigged: _Rigged, maps: Mapping[str, Map], names: tuple[str, ...], r
     poses = averaged([maps[k] for k in group])
     pairs = [apart[best, k] for k in group[1:]]
     first = maps[order[0]]
-    paths = (
-        paths_through(first, maps[best], poses, rigged.phases)
-        if rigged.wanted.instants > 1 and order[0] in group
-        else {}
-    )
+    through = rigged.wanted.instants > 1 and order[0] in group  # the first map holds the further instants
+    paths = paths_through(first, maps[best], poses, rigged.phases) if through else {}
     kinds = (best, *(k for k in order if k != best))
     seconds: dict[str, float] = {}
     for found in maps.values():
