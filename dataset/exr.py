@@ -38,6 +38,11 @@ class Layer(NamedTuple):
     channels: dict[str, NDArray[Any]]
 
     @property
+    def label(self) -> str:
+        """Its own name, or that of its part."""
+        return self.name or str(self.part.header.get("name") or "")
+
+    @property
     def kind(self) -> str:
         """What picture the channels make: RGBA, RGB, YC, YCA, YA, Y, or nothing."""
         height, width = window_shape(self.part.header, "dataWindow")
@@ -49,7 +54,7 @@ class Layer(NamedTuple):
         if "RY" in self.channels or "BY" in self.channels:
             chroma = [c for c in ("RY", "BY") if c in self.channels and self.channels[c].shape == half]
             return "YC" + alpha if "Y" in full and len(chroma) == 2 else ""
-        return "Y" + alpha if "Y" in full else ""
+        return "Y" + alpha if "Y" in full and "X" not in full else ""  # X, Y, Z is a vector
 
 
 def read_exr(path: Path, layer: str = "") -> Pixels:
@@ -57,8 +62,8 @@ def read_exr(path: Path, layer: str = "") -> Pixels:
 
     Args:
         path: of the file.
-        layer: of a layer, a view, a part, or a single channel; by default the first layer without a name, else a
-            Blender render's `Combined`, else the only one there is.
+        layer: of a layer, a view, a part, or a single channel; by default a Blender render's `Combined`, else the
+            first layer without a name, else the only one there is.
 
     Returns:
         float32[H,W,C], C 1 (gray), 3 or 4 (alpha, premultiplied). half and float as they are, uint as numbers.
@@ -96,8 +101,10 @@ def read_exr_depth(path: Path) -> Pixels:
         DataError: as `read_exr`, or no such channel.
     """
     parts = _read_parts(path)
-    every = [(name, part, c) for part in parts for name, c in part.channels.items()]
-    named = [e for wanted in DEPTHS for e in every if e[0].rpartition(".")[2] == wanted]
+    layers = [layer for part in parts for layer in _layers(part)]
+    every = [(name, layer.part, c) for layer in layers for name, c in layer.channels.items()]
+    plain = [layer for layer in layers if "X" not in layer.channels]  # X, Y, Z is a vector
+    named = [(k, layer.part, layer.channels[k]) for k in DEPTHS for layer in plain if k in layer.channels]
     planes = named or (every if len(every) == 1 else [])
     if not planes:
         colours = [c for c in parts[0].channels.values() if c.shape == window_shape(parts[0].header, "dataWindow")]
@@ -222,9 +229,9 @@ def _pick(path: Path, layers: list[Layer], wanted: str) -> Layer:
                     return Layer(wanted, layer.part, {"Y": samples})
         raise UsageError("no such layer in this EXR", value=f"{path}: {wanted}", expected=_told(layers))
     unnamed = [layer for layer in pictures if not layer.name]
-    combined = [layer for layer in pictures if layer.name.rpartition(".")[2] == "Combined"]
-    if unnamed or combined or len(pictures) == 1:
-        return (unnamed or combined or pictures)[0]
+    combined = [layer for layer in pictures if layer.label.rpartition(".")[2] == "Combined"]
+    if combined or unnamed or len(pictures) == 1:
+        return (combined or unnamed or pictures)[0]
     raise DataError(
         "this EXR holds several pictures" if pictures else "no RGB, RGBA, Y or luminance-chroma picture in this EXR",
         value=f"{path}: {_told(layers)}",

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spikerig.dataset.bayer import ColourTexture
 from spikerig.dataset.errors import DataError, NumericsError, UsageError
 from spikerig.dataset.exr import check_size, damaged, exr_head, read_exr, write_exr
 from spikerig.dataset.outfile import whole_file
@@ -177,7 +178,11 @@ def read_linear(
         colour = np.repeat(colour, 3, axis=2)
     if colour.shape[2] == 4:
         if background is None:
-            raise UsageError("the picture has alpha: say what lies behind it", value=path, next="give a background")
+            raise UsageError(
+                "the picture has alpha: say what lies behind it",
+                value=path,
+                next="give a background (--background 1; of a folder: background in transforms.json)",
+            )
         alpha, colour = colour[:, :, 3:], colour[:, :, :3]
         behind = background if linear else float(srgb_from_linear(background))
         colour = colour * (1 if linear else alpha) + behind * (1 - alpha)
@@ -212,12 +217,14 @@ def write_image(path: str | Path, pixels: ArrayLike, *, force: bool = False) -> 
         (_write_png if whole else write_exr)(part, array)
 
 
-def texture_png(path: str | Path, texture: Texture, gain: float | None = None, *, force: bool = False) -> float:
-    """Write a texture as an 8-bit PNG, sRGB(gain * light); pixels not known are transparent.
+def texture_png(
+    path: str | Path, texture: Texture | ColourTexture, gain: float | None = None, *, force: bool = False
+) -> float:
+    """Write a texture as an 8-bit PNG, sRGB(gain * light); pixels not known (in all colours) are transparent.
 
     Args:
         path: of the PNG.
-        texture: light float32[H,W] and known bool[H,W].
+        texture: light float32[H,W] or [H,W,3], known bool of its shape.
         gain: None takes the one that lifts the 99th percentile of known light to white.
         force: replace an existing file.
 
@@ -228,10 +235,12 @@ def texture_png(path: str | Path, texture: Texture, gain: float | None = None, *
         lit = texture.light[texture.known]
         top = float(np.percentile(lit, 99)) if lit.size else 0.0
         gain = 1 / top if top > 0 else 1.0
-    gray = srgb8_from_linear(np.where(texture.known, texture.light, 0) * np.float32(gain))
+    codes = srgb8_from_linear(np.where(texture.known, texture.light, 0) * np.float32(gain))
     if not texture.known.all():
-        gray = np.dstack([gray, gray, gray, np.where(texture.known, 255, 0).astype(np.uint8)])
-    write_image(path, gray, force=force)
+        known = np.atleast_3d(texture.known).all(2)
+        colours = codes if codes.ndim == 3 else np.dstack([codes] * 3)
+        codes = np.dstack([colours, np.where(known, 255, 0).astype(np.uint8)])
+    write_image(path, codes, force=force)
     return gain
 
 

@@ -77,19 +77,33 @@ def _parts(x: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]
     return whole.astype(np.int64), np.ceil((x - whole) * 2.0**32).astype(np.int64)
 
 
+def light_of_ticks(
+    light: NDArray[np.float32], knots: NDArray[np.int64], hold: bool, span: tuple[int, int] | None
+) -> NDArray[np.int64]:
+    """`fixed_light` of the ticks from span[0] to before span[1]; None: of all."""
+    first, last = (knots[0], knots[-1]) if span is None else span
+    return fixed_light(light, knots, hold=hold)[first - knots[0] : last - knots[0]]
+
+
 def fire(
-    light: NDArray[np.float32], knots: NDArray[np.int64], charge: NDArray, *, hold: bool, carry: bool = False
+    light: NDArray[np.float32],
+    knots: NDArray[np.int64],
+    charge: NDArray,
+    *,
+    hold: bool,
+    span: tuple[int, int] | None = None,
+    carry: bool = False,
 ) -> tuple[Bits, NDArray, NDArray[np.float64]]:
     """Integrate and fire, in closed form: spikes so far = floor of the charge so far, in thresholds.
 
     Every tick adds at most one threshold; what light is above that is clipped. With `carry` every tick adds all of
     its light, and whole thresholds wait for the ticks after: a tick at a time, at most 2^30 - 1 of them.
     """
-    every = fixed_light(light, knots, hold=hold)
+    every = light_of_ticks(light, knots, hold, span)
     if carry:
         return _carried(every, charge)
     taken = np.minimum(every, 2**32)
-    total = charge.astype(np.int64) + np.concatenate([np.zeros_like(taken[:1]), taken]).cumsum(0)[: len(taken) + 1]
+    total = charge.astype(np.int64) + np.concatenate([np.zeros((1, *charge.shape), np.int64), taken]).cumsum(0)
     fired = np.diff(total >> 32, axis=0)
     clipped = _sum(every - taken) / 2**32
     return pack(fired), (total[-1] & 0xFFFFFFFF).astype(np.uint32), clipped.astype(np.float64)
@@ -133,7 +147,7 @@ def events(
     seen = light[0].astype(np.float64)
     level, free = np.log(seen + eps), np.full(seen.shape, -np.inf)
     held = np.zeros(seen.shape, bool)
-    rows: list[NDArray[np.float64]] = []
+    rows: list[NDArray] = []
 
     def fire(where: NDArray[np.bool_], at: float, polarity: int) -> None:
         y, x = np.nonzero(where)
@@ -160,6 +174,7 @@ def events(
             level[one] = b[one]
         last = now
     found = np.concatenate([np.zeros((0, 4)), *rows])
+    found = found[np.rint(found[:, 0]) < end]
     found = found[np.lexsort((found[:, 2], found[:, 1], found[:, 0]))]
     t, y, x, polarity = np.rint(found).astype(np.int64).T
     return t, x.astype(np.uint16), y.astype(np.uint16), polarity.astype(np.int8)

@@ -20,15 +20,18 @@ MULTIPLIERS = (np.uint64(0xD2511F53), np.uint64(0xCD9E8D57))
 WEYL = (np.uint64(0x9E3779B9), np.uint64(0xBB67AE85))
 LOW = np.uint64(0xFFFFFFFF)
 FEW = F(8)  # electrons below which a Poisson count is found by inversion
+RARE = F(2.0**-12)  # chance below which that is done in float64
 
 # Of least maximal error (Lawson's iteration), rising powers: log2(1+t)/t for |t| <= 1/3; the normal quantile over
-# 2u - 1, in L = -log2 4u(1-u) below 8, and in sqrt(L) - 4 for L from 8 to 31.
-LOG2 = (1.442694067955017, -0.7213439345359802, 0.4810193181037903, -0.36092716455459595,
-        0.2845945954322815, -0.23468632996082306, 0.25199463963508606, -0.23195520043373108)  # fmt: skip
+# 2u - 1, in L = -log2 4u(1-u) below 8, and in sqrt(L) - 4 for L from 8 to 31; (2^t - 1)/t for |t| <= 1/2.
+LOG2 = (1.4426935911178589, -0.7214025855064392, 0.48106637597084045, -0.35773220658302307,
+        0.283658891916275, -0.2842307388782501, 0.2570645809173584)  # fmt: skip
 CENTRE = (1.2533117532730103, 0.2274535596370697, 0.00779822887852788, -0.0010466594249010086,
           -7.223698048619553e-05, 2.0450281226658262e-05, -1.48395349697239e-06, 3.8950791036995724e-08)  # fmt: skip
 TAIL = (4.4753618240356445, 1.184531331062317, 0.004461626056581736, -0.002450686413794756,
         0.0012992979027330875, -0.0007985380943864584, 0.0003666246775537729, -7.405880751321092e-05)  # fmt: skip
+EXP2 = (0.6931471824645996, 0.24022650718688965, 0.055503278970718384, 0.009618005715310574,
+        0.0013400283642113209, 0.00015475897816941142)  # fmt: skip
 
 
 def philox(counter: tuple[Words, Words, Words, Words], key: Key) -> tuple[Words, Words, Words, Words]:
@@ -86,9 +89,10 @@ def poisson(mean: Floats, word: Words) -> Floats:
         float32[...]: whole numbers (above 2^24 as far as float32 holds them).
 
     Edges:
-        Below a mean of 8 the exact inversion, to 2^-32 of probability; above, floor of the Cornish-Fisher expansion to
-        the third order, within 2.5e-4 of the distribution (total variation), the mean within 1e-6 and the variance
-        within 4e-4 of their values.
+        Below a mean of 8 the distribution function is inverted: within 1e-6 of the distribution (total variation), in
+        float64 where the chance is below 2^-12, so that rare counts are right to 2^-32 of probability. From 8 on, the
+        floor of the Cornish-Fisher expansion to the third order: within 2.5e-4 of the distribution, its mean within
+        2.5e-6 and its variance within 4e-4.
 
     Source:
         M. Giles: Algorithm 955, approximation of the inverse Poisson cumulative distribution function (2016), eq. 2.
@@ -114,19 +118,34 @@ def _many(mean: Floats, word: Words) -> Floats:
 
 def _few(mean: Floats, word: Words) -> Floats:
     """The count k whose P(K >= k) is above the chance 1 - u, and P(K >= k + 1) is not."""
-    m = mean.astype(np.float64)
-    chance = ((~word).astype(np.float64) + 0.5) * 2.0**-32
-    term = exp_minus(m)
-    above = 1.0 - term
-    count = np.zeros(m.shape)
+    chance = ((~word).astype(F) + F(0.5)) * F(2.0**-32)
+    rare = chance < RARE
+    scaled = mean * F(-1.4426950408889634)
+    n = (scaled + F(12582912.0)) - F(12582912.0)  # 1.5 * 2^23: the nearest whole number
+    t = scaled - n
+    scale = ((n.astype(np.int32) + 127) << 23).view(F)
+    change = scale * (t * _polynomial(EXP2, t))
+    term = scale + change  # exp(-mean) = P(K = 0)
+    above = (F(1) - scale) - change
+    counts = _invert(np.where(rare, F(1), chance), mean, term, above)
+    if rare.any():
+        few64 = mean.astype(np.float64)
+        chance64 = ((~word).astype(np.float64) + 0.5) * 2.0**-32
+        term64 = exp_minus(few64)
+        counts = np.where(rare, _invert(chance64, few64, term64, 1.0 - term64).astype(F), counts)
+    return counts
+
+
+def _invert(chance: Floats, mean: Floats, term: Floats, above: Floats) -> Floats:
+    count = np.zeros_like(mean)
     for k in range(1, 64):
         more = chance < above
         if not more.any():
             break
         count += more
-        term = term * m * (1.0 / k)
+        term = term * (mean * mean.dtype.type(1.0 / k))
         above = above - term
-    return count.astype(F)
+    return count
 
 
 def exp_minus(x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -111,7 +111,7 @@ class Frame:
     """An RGB picture and when it was exposed.
 
     Args:
-        pixels: uint8[H,W,3] encoded by `transfer`.
+        pixels: uint8[H,W,3] encoded by `transfer`; or uint16, full scale 65535, from a camera of more than 8 bits.
         transfer: "srgb" or "linear".
         start_ns: start of exposure of sensor row 0.
         exposure_ns: > 0; 0 for an instantaneous (simulated sharp) picture.
@@ -119,7 +119,7 @@ class Frame:
         clock: name of the clock of `start_ns`.
     """
 
-    pixels: NDArray[np.uint8]
+    pixels: NDArray[np.uint8] | NDArray[np.uint16]
     transfer: str = "srgb"
     start_ns: int = 0
     exposure_ns: int = 0
@@ -127,11 +127,23 @@ class Frame:
     clock: str = "rig"
 
     def __post_init__(self) -> None:
-        _set(self, "pixels", np.uint8)
+        _set(self, "pixels", np.uint16 if self.pixels.dtype == np.uint16 else np.uint8)
         if self.pixels.ndim != 3 or self.pixels.shape[2] != 3:
-            raise DataError("a frame is uint8[H,W,3]", value=self.pixels.shape)
+            raise DataError("a frame is uint8[H,W,3] or uint16[H,W,3]", value=self.pixels.shape)
         if self.transfer not in ("srgb", "linear"):
             raise DataError("unknown transfer of a frame", value=self.transfer, expected="srgb or linear")
+
+    @property
+    def full(self) -> int:
+        """The pixel value of full scale."""
+        return int(np.iinfo(self.pixels.dtype).max)
+
+    @property
+    def pixels8(self) -> NDArray[np.uint8]:
+        """The pixels in 8 bits, rounded where they have more."""
+        return (
+            np.rint(self.pixels / 257).astype(np.uint8) if self.full > 255 else self.pixels.astype(np.uint8, copy=False)
+        )
 
     @property
     def mid_ns(self) -> int:

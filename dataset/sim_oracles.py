@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset import philox
-from spikerig.dataset.oracles import Bits, fixed_light, pack
+from spikerig.dataset.oracles import Bits, light_of_ticks, pack
 from spikerig.dataset.philox import F, Key
 
 ONE = np.int64(2**32)
@@ -19,6 +19,7 @@ def fire_noisy(
     charge: NDArray,
     *,
     hold: bool,
+    span: tuple[int, int] | None = None,
     first_tick: int | None = None,
     shot: tuple[float | NDArray, Key] | None = None,
     comparator: tuple[float, Key] | None = None,
@@ -29,13 +30,13 @@ def fire_noisy(
     """Integrate and fire with noise: each tick the light, what noise makes of it, what counts, and a decision."""
     height, width = light.shape[1:]
     pixels = np.arange(height * width, dtype=np.uint32).reshape(height, width)
-    tick = int(knots[0]) if first_tick is None else first_tick
+    begin = int(knots[0]) if span is None else span[0]
     total, lost = charge.astype(np.int64), np.zeros((height, width), object)
     fired = np.zeros((height, width), bool)
     if before is not None:
         fired = np.unpackbits(before, axis=1, bitorder="little", count=width) != 0
     out = []
-    for now, taken in enumerate(fixed_light(light, knots, hold=hold), tick):
+    for now, taken in enumerate(light_of_ticks(light, knots, hold, span), begin if first_tick is None else first_tick):
         if shot is not None:
             electrons = np.broadcast_to(np.asarray(shot[0], F), (height, width))
             taken = shot_noise(taken, electrons, philox.words(shot[1], now, pixels))
@@ -80,5 +81,5 @@ def share_of(light: NDArray[np.int64], share: float) -> NDArray[np.int64]:
 
 
 def fixed_share(share: float) -> int:
-    """A share below one in units of 2^-32."""
+    """A share in units of 2^-32; of one, all but a unit."""
     return min(round(share * 2**32), 2**32 - 1)

@@ -72,7 +72,7 @@ SCHEMA = r"""
 /views/{view}?                      | group |        | one synchronised look
   @split                            | text  |        | "train" or "test"
   @order                            | int   |        | position in the scene, from 0
-/views/{view}/pixels                | u1    | H W 3  | the RGB frame, encoded
+/views/{view}/pixels                | u1/u2 | H W 3  | the RGB frame, encoded; full scale is the type's largest value
   @transfer                         | text  |        | "srgb" or "linear"
   @start_ns                         | int   |        | start of exposure of sensor row 0
   @exposure_ns                      | int   |        | exposure time
@@ -123,7 +123,10 @@ SCHEMA = r"""
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A line of the schema: an object ("group" or a dataset), or an attribute ("text", "int", "float")."""
+    """A line of the schema: an object ("group" or a dataset), or an attribute ("text", "int", "float").
+
+    A dataset's `dtype` may name several, "u1/u2": of these it has one.
+    """
 
     path: str
     dtype: str
@@ -131,6 +134,11 @@ class Row:
     about: str
     required: bool
     attrs: Mapping[str, Row]
+
+    @property
+    def dtypes(self) -> tuple[np.dtype[Any], ...]:
+        """The types a dataset may have."""
+        return tuple(np.dtype("<" + kind) for kind in self.dtype.split("/"))
 
 
 def parse_schema(text: str) -> dict[str, Row]:
@@ -223,7 +231,7 @@ def dataset_at(parent: h5py.Group, name: str) -> h5py.Dataset:
 def check_shape(found: h5py.Dataset) -> None:
     """Refuse a dataset that is not of the type and shape of its row."""
     row = row_of(found.name)
-    if row is None or found.dtype != np.dtype("<" + row.dtype) or len(found.shape) != len(row.shape):
+    if row is None or found.dtype not in row.dtypes or len(found.shape) != len(row.shape):
         raise refuse(spot(found), f"{found.dtype} of shape {found.shape}: not what the schema says")
     if any(isinstance(want, int) and want != n for want, n in zip(row.shape, found.shape, strict=True)):
         raise refuse(spot(found), f"shape {found.shape}, where the schema says {row.shape}")

@@ -290,7 +290,9 @@ def put(parent: h5py.Group, name: str, values: ArrayLike) -> h5py.Dataset:
     row = row_of(f"{(parent.name or '').rstrip('/')}/{name}")
     if row is None:
         raise UsageError("not in the schema", value=f"{parent.name}/{name}")
-    return parent.create_dataset(name, data=np.ascontiguousarray(values, np.dtype("<" + row.dtype)))
+    values = np.asarray(values)
+    kind = values.dtype if values.dtype in row.dtypes else row.dtypes[0]
+    return parent.create_dataset(name, data=np.ascontiguousarray(values, kind))
 
 
 def put_json(parent: h5py.Group, name: str, record: Mapping[str, Any]) -> None:

@@ -52,7 +52,19 @@ struct Light {
   const int64_t *knots;    // int64[segments + 1]
   int64_t segments, height, width;
   bool hold;               // rows[k] over segment k; else linear from rows[k] to rows[k + 1]
+  int64_t begin, end;      // ticks that are run, within the knots
+  int64_t ticks() const { return end - begin; }
 };
+
+// Calls run(k, ticks, done, first) for each segment that is run at least in part: how many ticks the segment has, how
+// many of them were before, and the tick it starts with; run(k, ...) runs first .. min(knots[k + 1], end).
+template <class Run>
+void each_segment(const Light &light, Run run) {
+  for (int64_t k = 0; k < light.segments; ++k) {
+    const int64_t from = light.knots[k], to = light.knots[k + 1], first = std::max(from, light.begin);
+    if (first < std::min(to, light.end)) run(k, to - from, first - from, first);
+  }
+}
 
 // Noise of fire_noisy(), in dataset/sim_oracles.py.
 struct Noise {

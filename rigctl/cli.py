@@ -13,11 +13,11 @@ from spikerig.dataset.errors import UsageError
 from spikerig.dataset.terminal import Progress, emit, note
 
 
-def _workers(asked: int) -> int:
+def cores(asked: int) -> int:
+    """How many processes to start: as asked, or for 0 one a core that this process may use."""
     if asked < 0:
         raise UsageError("workers are counted from 1; 0 means one a core", value=asked)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return asked or cores
+    return asked or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
 def capture(
@@ -31,7 +31,7 @@ def capture(
 ) -> None:
     """Simulate a capture: shaken viewpoints of an analytic world, as spikes and blurry pictures, with the truth.
 
-    A killed run leaves OUT.partial and is started again with --force; the demo scene takes seconds.
+    Interrupted or killed, it goes on where it was when the same command is given again; the demo takes seconds.
     """
     from spikerig.rigctl.sim.capture import capture as play
     from spikerig.rigctl.sim.spec import load_scene_toml, with_changes
@@ -39,7 +39,7 @@ def capture(
     began = time.monotonic()
     spec = with_changes(load_scene_toml(scene), seed=seed, views=views)
     bar = Progress(f"simulating '{spec.name}'", spec.orbit.views, "views")
-    told = play(spec, out, workers=_workers(workers), force=force, done=lambda taken: bar.step())
+    told = play(spec, out, workers=cores(workers), force=force, done=bar.step)
     _tell("spikerig.sim.capture/1", out, told, began, as_json)
 
 
@@ -65,7 +65,7 @@ def frames(
     began = time.monotonic()
     found = read_folder(folder, settings, protocol=protocol, seed=seed, bad_values=bad_values)
     bar = Progress(f"simulating '{found.rig.name}'", len(found.views), "views")
-    told = capture_folder(found, out, workers=_workers(workers), force=force, done=lambda taken: bar.step())
+    told = capture_folder(found, out, workers=cores(workers), force=force, done=lambda taken: bar.step())
     _tell("spikerig.sim.frames/1", out, told, began, as_json)
     if told["bad_values"]["pictures"]:
         bad = told["bad_values"]

@@ -27,8 +27,11 @@ struct Flat {
 };
 
 struct Line {
-  double start, value, slope;
-  double operator()(double t) const { return value + slope * (t - start); }
+  double start, value, slope, stop, last;  // rounding must not carry it below light + eps of its darker end
+  double operator()(double t) const {
+    const double v = value + slope * (t - start);
+    return t >= stop ? last : std::min(std::max(v, std::min(value, last)), std::max(value, last));
+  }
   double when(double level, double from, double to) const {
     return std::min(std::max(start + (level - value) / slope, from), to);
   }
@@ -36,8 +39,10 @@ struct Line {
 
 // A first-order low-pass of a line: value + slope u + rest (exp(-u / tau) - 1).
 struct Slow {
-  double start, value, slope, rest, tau;
-  double operator()(double t) const { return value + slope * (t - start) + rest * std::expm1(-(t - start) / tau); }
+  double start, value, slope, rest, tau, eps;
+  double operator()(double t) const {
+    return std::max(value + slope * (t - start) + rest * std::expm1(-(t - start) / tau), eps);
+  }
 
   // Newton's steps, kept within a bracket that shrinks; monotone between `from` and `to`.
   double when(double level, double from, double to) const {
@@ -186,8 +191,8 @@ void run(const EventLight &light, const EventSensor &s, int64_t first, int64_t n
       const int64_t pixel = first + i, noises = s.noise_start ? s.noise_start[pixel + 1] : 0;
       Pixel &p = b.pixel[i];
       const double slope = light.hold ? 0.0 : (static_cast<double>(z[i]) - a[i]) / (to - from);
-      const Slow slow{from, b.slow[i] + s.eps, slope, b.slow[i] - a[i] + slope * s.tau, s.tau};
-      if (s.tau > 0) b.slow[i] += slope * (to - from) + slow.rest * settled;
+      const Slow slow{from, b.slow[i] + s.eps, slope, b.slow[i] - a[i] + slope * s.tau, s.tau, s.eps};
+      if (s.tau > 0) b.slow[i] = std::max(b.slow[i] + slope * (to - from) + slow.rest * settled, 0.0);
       if (!b.due[i] && !(p.noise < noises && s.noise_at[p.noise] <= to)) continue;
       auto &&sink = open(i);
       Walk<std::remove_reference_t<decltype(sink)>> walk{s, s.up[pixel], s.down[pixel], p, sink};
@@ -199,7 +204,7 @@ void run(const EventLight &light, const EventSensor &s, int64_t first, int64_t n
       } else if (light.hold) {
         fine = walk.stretch(Flat{a[i] + s.eps}, from, to, noises);
       } else {
-        fine = walk.stretch(Line{from, a[i] + s.eps, slope}, from, to, noises);
+        fine = walk.stretch(Line{from, a[i] + s.eps, slope, to, z[i] + s.eps}, from, to, noises);
       }
       if (!fine) return;
       b.watch(s, i, pixel);

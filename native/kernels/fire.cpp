@@ -58,32 +58,102 @@ struct Pixels {
     }
   }
 
-  // Any light.
-  template <bool ramps, bool carry>
-  void run_any(int64_t g, int64_t ticks, uint8_t *out, int64_t frame, int64_t bytes) {
-    constexpr int64_t RUN = AT_ONCE * LANES;
-    for (int64_t at = g; at < g + GROUP && (at - g) / 8 < bytes; at += RUN)
-      step<ramps, carry, false, false, false>(ramp, charges, nullptr, nullptr, carry ? INT32_MAX : 1, at, ticks, 0,
-                                              out + (at - g) / 8, frame, bytes - (at - g) / 8);
-    if (!carry) return;
+  // Any light; what is above one threshold a tick is clipped. Its sum is not added up tick by tick: it is the sum of
+  // all light, n V + D n(n-1)/2 and a unit for every tick after a carry of the low words, less what was fired and left.
+  template <bool ramps>
+  void run_bright(int64_t g, int64_t ticks, uint8_t *out, int64_t frame, int64_t bytes) {
+    constexpr int N = 2;
+    constexpr int64_t RUN = N * LANES;
+    for (int64_t at = g; at < g + GROUP && (at - g) / 8 < bytes; at += RUN) {
+      Pair v[N];
+      vu low[N], charge[N], fired[N], carried[N];
+#pragma GCC unroll 2
+      for (int k = 0; k < N; ++k) {
+        const int64_t p = at + k * LANES;
+        v[k] = {load<vi>(ramp.v_whole + p), load<vu>(ramp.v_word + p)};
+        low[k] = load<vu>(ramp.v_low + p);
+        charge[k] = load<vu>(charges.word + p);
+        fired[k] = carried[k] = vu{};
+      }
+      const int64_t room = std::min<int64_t>(bytes - (at - g) / 8, RUN / 8);
+      for (int64_t t = 0; t < ticks; ++t) {
+        uint64_t spikes = 0;
+#pragma GCC unroll 2
+        for (int k = 0; k < N; ++k) {
+          const Mask dark = less(v[k].whole, wholes(1));
+          const vu after = add_where(dark, charge[k], v[k].word);
+          const Mask spike = either(inverse(dark), less(after, charge[k]));
+          charge[k] = after;
+          fired[k] = add_one(spike, fired[k]);
+          spikes |= static_cast<uint64_t>(lane_bits(spike)) << (k * LANES);
+          if (ramps) {
+            const Mask carry = advance(v[k], low[k], ramp, at + k * LANES);
+            carried[k] = add_where(carry, carried[k], words(static_cast<uint32_t>(ticks - 1 - t)));
+          }
+        }
+        if (room == RUN / 8)
+          std::memcpy(out + t * frame + (at - g) / 8, &spikes, RUN / 8);
+        else
+          std::memcpy(out + t * frame + (at - g) / 8, &spikes, static_cast<size_t>(room));
+      }
+#pragma GCC unroll 2
+      for (int k = 0; k < N; ++k) {
+        const int64_t p = at + k * LANES;
+        clip(p, static_cast<uint64_t>(ticks), charge[k], fired[k], carried[k]);
+        store(ramp.v_whole + p, v[k].whole);
+        store(ramp.v_word + p, v[k].word);
+        store(ramp.v_low + p, low[k]);
+        store(charges.word + p, charge[k]);
+      }
+    }
+  }
+
+  // Adds what n ticks clipped, from the light and charge at their start, in the arrays, and what came of it.
+  void clip(int64_t p, uint64_t n, vu charge, vu fired, vu carried) {
+    alignas(64) uint32_t after[LANES], spikes[LANES], units[LANES];
+    store(after, charge);
+    store(spikes, fired);
+    store(units, carried);
+    for (int k = 0; k < LANES; ++k) {
+      const uint64_t v = static_cast<uint64_t>(ramp.v_whole[p + k]) << 32 | ramp.v_word[p + k];
+      const uint64_t d = static_cast<uint64_t>(ramp.d_whole[p + k]) << 32 | ramp.d_word[p + k];
+      const uint64_t in = n * v + n * (n - 1) / 2 * d + units[k];
+      charges.lost[p + k] += in - (static_cast<uint64_t>(spikes[k]) << 32) - after[k] + charges.word[p + k];
+    }
+  }
+
+  // Any light, all of which counts.
+  template <bool ramps>
+  void run_carried(int64_t g, int64_t ticks, uint8_t *out, int64_t frame, int64_t bytes) {
+    for (int64_t at = g; at < g + GROUP && (at - g) / 8 < bytes; at += AT_ONCE * LANES)
+      step<ramps, false, false, false>(ramp, charges, nullptr, nullptr, INT32_MAX, at, ticks, 0, out + (at - g) / 8,
+                                       frame, bytes - (at - g) / 8);
     uint32_t all = 0;
     for (int64_t i = g; i < g + GROUP; ++i) all |= static_cast<uint32_t>(charges.whole[i]);
     owing[g / GROUP] = all != 0;
   }
 
   template <bool ramps, bool carry>
-  void run_segment(int64_t pixels, int64_t ticks, uint8_t *out, int64_t frame, int64_t bytes) {
-    const double share = 1.0 / static_cast<double>(ticks);
-    for (int64_t g = 0; g < pixels; g += GROUP) bright[g / GROUP] = ramp.begin<ramps, carry>(g, GROUP, share);
-    for (int64_t t = 0; t < ticks; t += TICKS)
+  void run_segment(int64_t pixels, int64_t whole, int64_t done, int64_t ticks, uint8_t *out, int64_t frame,
+                   int64_t bytes) {
+    const double share = 1.0 / static_cast<double>(whole);
+    for (int64_t g = 0; g < pixels; g += GROUP) {
+      bright[g / GROUP] = ramp.begin<ramps, carry>(g, GROUP, share);
+      if (ramps) ramp.skip(g, GROUP, done);
+    }
+    for (int64_t t = 0; t < ticks; t += TICKS) {
+      charges.settle(std::min(TICKS, ticks - t));
       for (int64_t g = 0; g < pixels; g += GROUP) {
         const int64_t n = std::min(TICKS, ticks - t);
         uint8_t *to_bits = out + t * frame + g / 8;
-        if (bright[g / GROUP] || (carry && owing[g / GROUP]))
-          run_any<ramps, carry>(g, n, to_bits, frame, bytes - g / 8);
+        if (carry && (bright[g / GROUP] || owing[g / GROUP]))
+          run_carried<ramps>(g, n, to_bits, frame, bytes - g / 8);
+        else if (bright[g / GROUP])
+          run_bright<ramps>(g, n, to_bits, frame, bytes - g / 8);
         else
           run_dim<ramps>(g, n, to_bits, frame, bytes - g / 8);
       }
+    }
   }
 };
 
@@ -106,26 +176,27 @@ void fire(const Light &light, bool carry, int64_t *charge, uint8_t *bits, double
         if (state.charges.whole[i + j]) state.owing[(i + j) / GROUP] = true;
       }
     });
-    for (int64_t k = 0; k < light.segments; ++k) {
-      const int64_t ticks = light.knots[k + 1] - light.knots[k];
-      if (ticks == 0) continue;
+    each_segment(light, [&](int64_t k, int64_t whole, int64_t done, int64_t first) {
       const float *from = light.rows + k * image, *to = light.hold ? from : from + image;
       each_run([&](int64_t i, int64_t pixel, int64_t n) {
         std::copy_n(from + pixel, n, state.ramp.from + i);
         std::copy_n(to + pixel, n, state.ramp.to + i);
       });
-      uint8_t *out = bits + (light.knots[k] - light.knots[0]) * frame + at.begin;
+      const int64_t ticks = std::min(light.knots[k + 1], light.end) - first;
+      uint8_t *out = bits + (first - light.begin) * frame + at.begin;
+      const auto run = [&](auto ramps, auto all) {
+        state.run_segment<decltype(ramps)::value, decltype(all)::value>(pixels, whole, done, ticks, out, frame,
+                                                                        at.bytes());
+      };
       if (light.hold)
-        carry ? state.run_segment<false, true>(pixels, ticks, out, frame, at.bytes())
-              : state.run_segment<false, false>(pixels, ticks, out, frame, at.bytes());
+        carry ? run(Flag<false>{}, Flag<true>{}) : run(Flag<false>{}, Flag<false>{});
       else
-        carry ? state.run_segment<true, true>(pixels, ticks, out, frame, at.bytes())
-              : state.run_segment<true, false>(pixels, ticks, out, frame, at.bytes());
-    }
+        carry ? run(Flag<true>{}, Flag<true>{}) : run(Flag<true>{}, Flag<false>{});
+    });
     each_run([&](int64_t i, int64_t pixel, int64_t n) {
       for (int64_t j = 0; j < n; ++j) {
         charge[pixel + j] = static_cast<int64_t>(state.charges.whole[i + j]) << 32 | state.charges.word[i + j];
-        clipped[pixel + j] = static_cast<double>(state.charges.lost[i + j]) / UNIT;
+        clipped[pixel + j] = state.charges.lost_of(i + j);
       }
     });
   });

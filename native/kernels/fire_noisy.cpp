@@ -12,15 +12,14 @@ struct State {
   Draws draws;
 };
 
-using Step = decltype(&step<true, true, true, true, true>);
+using Step = decltype(&step<true, true, true, true>);
 
 // By shot, comparator and loss.
 Step step_for(const Noise &noise) {
   static const Step table[8] = {
-      step<true, true, false, false, false>, step<true, true, true, false, false>,
-      step<true, true, false, true, false>,  step<true, true, true, true, false>,
-      step<true, true, false, false, true>,  step<true, true, true, false, true>,
-      step<true, true, false, true, true>,   step<true, true, true, true, true>,
+      step<true, false, false, false>, step<true, true, false, false>, step<true, false, true, false>,
+      step<true, true, true, false>,   step<true, false, false, true>, step<true, true, false, true>,
+      step<true, false, true, true>,   step<true, true, true, true>,
   };
   return table[(noise.electrons ? 1 : 0) + (noise.sd > 0 ? 2 : 0) + (noise.loss ? 4 : 0)];
 }
@@ -50,34 +49,34 @@ void fire_noisy(const Light &light, int64_t first_tick, const Noise &noise, bool
       }
     });
     if (before) std::memcpy(s.draws.before, before + at.begin, static_cast<size_t>(at.bytes()));
-    for (int64_t k = 0; k < light.segments; ++k) {
-      const int64_t ticks = light.knots[k + 1] - light.knots[k];
-      if (ticks == 0) continue;
+    each_segment(light, [&](int64_t k, int64_t whole, int64_t done, int64_t begin) {
       const float *from = light.rows + k * image, *to = light.hold ? from : from + image;
       each_run([&](int64_t i, int64_t pixel, int64_t n) {
         std::copy_n(from + pixel, n, s.ramp.from + i);
         std::copy_n(to + pixel, n, s.ramp.to + i);
       });
-      const double share = 1.0 / static_cast<double>(ticks);
-      constexpr int64_t ROW = 64;
-      for (int64_t i = 0; i < pixels; i += ROW)
-        light.hold ? s.ramp.begin<false, true>(i, ROW, share) : s.ramp.begin<true, true>(i, ROW, share);
-      const int64_t since = light.knots[k] - light.knots[0];
-      for (int64_t t = 0; t < ticks; t += TICKS) {
-        const int64_t n = std::min(TICKS, ticks - t), first = first_tick + since + t;
-        s.draws.drawn = (first & 3) != 0 && s.draws.drawn && s.draws.quad == first >> 2;
+      const double share = 1.0 / static_cast<double>(whole);
+      if (light.hold)
+        s.ramp.begin<false, true>(0, PIXELS, share);
+      else
+        s.ramp.begin<true, true>(0, PIXELS, share);
+      s.ramp.skip(0, PIXELS, done);
+      const int64_t end = std::min(light.knots[k + 1], light.end);
+      for (int64_t t = begin; t < end; t += TICKS) {
+        const int64_t n = std::min(TICKS, end - t), since = t - light.begin, first = first_tick + since;
+        s.charges.settle(n);
         for (int64_t i = 0; i < pixels; i += AT_ONCE * LANES)
           run(s.ramp, s.charges, &s.draws, &noise, carry ? INT32_MAX : 1, i, n, first,
-              bits + (since + t) * frame + at.begin + i / 8, frame, at.bytes() - i / 8);
+              bits + since * frame + at.begin + i / 8, frame, at.bytes() - i / 8);
         s.draws.quad = (first + n - 1) >> 2;
         s.draws.drawn = true;
       }
-    }
+    });
     each_run([&](int64_t i, int64_t pixel, int64_t n) {
       for (int64_t j = 0; j < n; ++j) {
         charge[pixel + j] = static_cast<int64_t>(static_cast<uint64_t>(s.charges.whole[i + j]) << 32 |
                                                  s.charges.word[i + j]);
-        lost[pixel + j] = static_cast<double>(s.charges.lost[i + j]) / UNIT;
+        lost[pixel + j] = s.charges.lost_of(i + j);
       }
     });
   });

@@ -73,6 +73,19 @@ struct Ramp {
     }
     return bright;
   }
+
+  // Goes some ticks on. Whole thresholds come out right where they were set.
+  void skip(int64_t i, int64_t pixels, int64_t ticks) {
+    for (int64_t p = i; ticks && p < i + pixels; ++p) {
+      const auto joined = [](int32_t whole, uint32_t word, uint32_t low) {
+        return static_cast<__int128>(whole) * (static_cast<__int128>(1) << 64) + (static_cast<uint64_t>(word) << 32 | low);
+      };
+      const __int128 v = joined(v_whole[p], v_word[p], v_low[p]) + ticks * joined(d_whole[p], d_word[p], d_low[p]);
+      v_whole[p] = static_cast<int32_t>(v >> 64);
+      v_word[p] = static_cast<uint32_t>(v >> 32);
+      v_low[p] = static_cast<uint32_t>(v);
+    }
+  }
 };
 
 }  // namespace

@@ -54,6 +54,7 @@ inline Mask from_bits(uint32_t bits) { return static_cast<Mask>(bits); }
 inline vu pick(Mask m, vu a, vu b) { return (vu)_mm512_mask_mov_epi32((__m512i)b, m, (__m512i)a); }
 inline vu keep(Mask m, vu x) { return (vu)_mm512_maskz_mov_epi32(m, (__m512i)x); }
 inline vu add_where(Mask m, vu a, vu b) { return (vu)_mm512_mask_add_epi32((__m512i)a, m, (__m512i)a, (__m512i)b); }
+inline vf add_where(Mask m, vf a, vf b) { return (vf)_mm512_mask_add_ps((__m512)a, m, (__m512)a, (__m512)b); }
 inline vu add_one(Mask m, vu a) {
   return (vu)_mm512_mask_sub_epi32((__m512i)a, m, (__m512i)a, _mm512_set1_epi32(-1));
 }
@@ -69,6 +70,7 @@ inline Mask zero_where(Mask m, vu a) { return m & (Mask)(a == 0); }
 inline vu pick(Mask m, vu a, vu b) { return ((vu)m & a) | (~(vu)m & b); }
 inline vu keep(Mask m, vu x) { return (vu)m & x; }
 inline vu add_where(Mask m, vu a, vu b) { return a + ((vu)m & b); }
+inline vf add_where(Mask m, vf a, vf b) { return a + (vf)((vu)m & (vu)b); }
 inline vu add_one(Mask m, vu a) { return a - (vu)m; }
 #if SPIKERIG_LANES == 8
 inline uint32_t lane_bits(Mask m) { return static_cast<uint32_t>(_mm256_movemask_ps((__m256)m)); }

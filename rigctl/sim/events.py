@@ -84,7 +84,7 @@ def simulate_events(
         is only needed to choose the knots (`adaptive.adaptive_phases`).
     """
     at_ns = (knots - knots[0]) * (NS / rate_hz)
-    size, span_ns = light.shape[1:], round(float(at_ns[-1]))
+    size, span_ns = (light.shape[1], light.shape[2]), round(float(at_ns[-1]))
     found = events(
         light,
         at_ns,

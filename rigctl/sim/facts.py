@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.images import srgb_from_linear
+
+if TYPE_CHECKING:
+    from spikerig.rigctl.sim.sensor import Light
 
 Floats = NDArray[np.floating]
 PART = 95.0  # a bound holds for this share of the pixels, percent
@@ -28,7 +32,7 @@ class Bound:
     Args:
         spikes: change of the spike count of one exposure: whole from 1 on; below 1 the 95th percentile is no change
             at all, and the number is the share of pixels that change, over 5 %, so that small bounds may be summed.
-        dn: change of an RGB value, digital numbers of 255.
+        dn: change of an RGB value, digital numbers of 255; these are whole too, and told in the same way.
         formula: where it comes from, with this scene's numbers.
     """
 
@@ -62,6 +66,9 @@ class Facts:
         views: how many.
         period_s: from one exposure to the next.
         depth: (nearest, median) distance along the axis, world units; infinite where not known.
+        looks: the light of the surveyed views, for effects whose change is not a function of single pixels.
+        means: of each look, the exposure's mean light on the spike sensor float64[H,W] and in RGB float64[H,W,3].
+        response: of the spike sensor to linear red, green and blue, thresholds a tick.
     """
 
     light: Floats
@@ -83,6 +90,9 @@ class Facts:
     views: int
     period_s: float
     depth: tuple[float, float] = (np.inf, np.inf)
+    looks: tuple[Light, ...] = ()
+    means: tuple[tuple[Floats, Floats], ...] = ()
+    response: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def exposure_s(self) -> float:
@@ -91,8 +101,8 @@ class Facts:
 
     @property
     def rate(self) -> Floats:
-        """float64[n], spikes a tick: the light, at most one."""
-        return np.minimum(self.light, 1.0)
+        """float64[n], spikes a tick: the light, less what is clipped."""
+        return self.light - surplus(self.light, self.light_max)
 
     @property
     def counts(self) -> Floats:
@@ -110,7 +120,13 @@ class Facts:
         The count of a steady pixel moves by the light times the ticks, and not beyond one spike a tick.
         """
         after = change(self.light) if callable(change) else self.light + np.asarray(change)
-        moved = np.clip(after, 0, 1) - self.rate
+        after = np.maximum(after, 0)
+        moved = after - surplus(after, after + (self.light_max - self.light)) - self.rate
+        return self.counted(moved * self.ticks, moved * self.margin_ticks, share)
+
+    def spikes_between(self, before: Floats, after: Floats, share: float = 1.0) -> float:
+        """Change of the spike count between two lights, thresholds a tick; any shapes that go together."""
+        moved = np.clip(after, 0, 1) - np.clip(before, 0, 1)
         return self.counted(moved * self.ticks, moved * self.margin_ticks, share)
 
     def counted(self, change: Floats, before: Floats | float = 0.0, share: float = 1.0) -> float:
@@ -151,11 +167,24 @@ class Facts:
         return np.random.default_rng(95).standard_normal((kinds, -(-DRAWS // n), n))
 
     def dn(self, change: Floats | Callable[[Floats], Floats]) -> float:
-        """Change of an RGB value when linear light changes: by an amount [n,3] either way, or to a function's."""
-        before = srgb_from_linear(np.clip(self.rgb, 0, 1))
+        """Change of an RGB value when linear light changes: by an amount [..,n,3] either way, or to a function's."""
         if callable(change):
-            both = [change(self.rgb)]
-        else:
-            both = [self.rgb + np.asarray(change), self.rgb - np.asarray(change)]
-        moved = [np.abs(srgb_from_linear(np.clip(after, 0, 1)) - before) for after in both]
-        return 255 * self.most(np.max(moved, axis=0))
+            return self.dn_between(self.rgb, change(self.rgb))
+        return max(self.dn_between(self.rgb, self.rgb + sign * np.asarray(change)) for sign in (1, -1))
+
+    def dn_between(self, before: Floats, after: Floats) -> float:
+        """Change of an RGB value between two linear lights; whole values, so told as `counted` tells counts."""
+        codes = [srgb_from_linear(np.clip(light, 0, 1)) for light in (before, after)]
+        return self.counted(255 * (codes[1] - codes[0]))
+
+
+def surplus(mean: Floats, most: Floats) -> Floats:
+    """Light beyond one threshold a tick, on average, of light whose values over time spread evenly around its mean.
+
+    Edges:
+        They reach from twice the mean less the most, or if that is negative from 0 for a part of the time.
+    """
+    least = np.maximum(2 * mean - most, 0)
+    span = np.maximum(most - least, 1e-12)
+    part = np.minimum(1, 2 * mean / np.maximum(most, 1e-12))
+    return np.where(least < 1, part * np.maximum(most - 1, 0) ** 2 / (2 * span), np.maximum(mean - 1, 0))

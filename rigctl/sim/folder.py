@@ -105,7 +105,7 @@ def read_folder(
         faults.add("views", "hold no picture that can be read")
     faults.raise_any()
     name = read.name or str(table.get("name") or root.resolve().name)
-    rig = Rig(name, read.seed, cast(Camera, camera), read.exposure, read.sensor, read.effects)
+    rig = Rig(name, read.seed, cast(Camera, camera), read.exposure, read.sensor, read.effects, read.events)
     return Folder(rig, read, tuple(v for v in views if v is not None), background, points, layer, bad_values)
 
 

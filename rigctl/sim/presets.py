@@ -6,6 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from spikerig.dataset.errors import UsageError
+from spikerig.rigctl.sim.effects import Effect, read_effects
+from spikerig.rigctl.sim.limits import Faults
+
 
 @dataclass(frozen=True, slots=True)
 class Preset:
@@ -47,6 +51,19 @@ SCSIM: tuple[Mapping[str, Any], ...] = (
 )
 
 PRESETS: Mapping[str, Preset] = {
+    "gopro9": Preset(
+        "rgb",
+        "GoPro HERO9 at 1080p120. Read-out: GPMF files say it (SROT), none of a HERO9 was found; it is below a frame "
+        "of 119.88 fps (8.34 ms), 7 ms is taken. Electrons: usual for pixels of 1.1 to 1.5 um, not measured. 8 bits "
+        "4:2:0, H.264 or HEVC: Open GoPro's file names GH and GX. Bit rate: none published for this mode was found, 60 "
+        "Mbit/s is taken",
+        effects=(
+            {"name": "rolling_shutter", "readout_ms": 7.0},
+            {"name": "rgb_noise", "full_well_e": 6000.0, "read_e": 2.5},
+            {"name": "bayer", "pattern": "rggb"},
+            {"name": "video_codec", "codec": "hevc", "mbit_s": 60.0, "fps": 119.88, "full_px": 1920 * 1080},
+        ),
+    ),
     "vidar-ideal": Preset("spike", "the integrate-and-fire definition (SpikeNVS Eq. 5 and 6), nothing else"),
     "vidar-scsim": Preset("spike", "SCSim (arXiv 2304.03129), v2s.py, a 250x400 Vidar at 20 kHz", SCSIM),
     "vidar-map": Preset("spike", "the sensor's own maps, named by sensor.map"),
@@ -62,3 +79,18 @@ def preset_effects(*names: str, map: str = "") -> list[Mapping[str, Any]]:
     """The effect tables of presets, in order; empty names give none. `map`: the file of `vidar-map`."""
     tables = [table for name in names if name for table in PRESETS[name].effects]
     return tables + ([{"name": "sensor_map", "file": map}] if map and "vidar-map" in names else [])
+
+
+def sensor_effects(name: str) -> list[Effect]:
+    """The effects of a spike camera's preset, and the random phase that any has.
+
+    Raises:
+        UsageError: no such preset, or one that needs a map.
+    """
+    if name not in preset_names("spike")[1:] or name == "vidar-map":
+        known = [n for n in preset_names("spike")[1:] if n != "vidar-map"]
+        raise UsageError("no such sensor preset", value=name, expected=", ".join(known))
+    faults = Faults(f"preset {name}")
+    found = read_effects([*PRESETS[name].effects, "initial_phase"], faults)
+    faults.raise_any()
+    return list(found.values())

@@ -47,6 +47,40 @@ def window_weights(light: Light, begin: NDArray[np.float64]) -> NDArray[np.float
     return weights
 
 
+def shares_of(light: Light, at: NDArray[np.float64], weight: NDArray[np.float64] | float) -> NDArray[np.float64]:
+    """Share of each picture in sums over instants.
+
+    Args:
+        light: for its knots.
+        at: ticks, float64[R,N]; beyond the light, time runs back and forth over it.
+        weight: of each instant.
+
+    Returns:
+        float64[R,K].
+    """
+    knots = light.knots.astype(np.float64)
+    span = knots[-1] - knots[0]
+    at = knots[0] + span - np.abs((at - knots[0]) % (2 * span) - span)
+    k = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
+    later = np.zeros(at.shape) if light.hold else (at - knots[k]) / (knots[k + 1] - knots[k])
+    row = np.arange(len(at))[:, None] * len(knots) + k
+    size = len(at) * len(knots)
+    total = np.zeros(size + 1)
+    np.add.at(total, row, weight * (1 - later))
+    np.add.at(total, row + 1, weight * later)
+    return total[:size].reshape(len(at), len(knots))[:, : len(light.rgb)]
+
+
+def wave_means(light: Light, hz: float) -> tuple[Floats, Floats]:
+    """Mean over the exposure of linear light x cos and x sin of 2 pi hz t, t from its start; float64[H,W,3] each."""
+    begin, end = light.exposure
+    after = np.asarray((np.arange(4096) + 0.5) * ((end - begin) / 4096), np.float64)
+    angle = 2 * np.pi * hz * after / light.rate_hz
+    waves = np.stack([np.cos(angle), np.sin(angle)]) / 4096
+    cosine, sine = np.tensordot(shares_of(light, np.stack([begin + after] * 2), waves), light.rgb, 1)
+    return cosine, sine
+
+
 def expose(light: Light, row_ns: float = 0.0) -> NDArray[np.float64]:
     """Mean linear light on the RGB arm over the exposure, float64[H,W,3].
 

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spikerig.dataset.bayer import mosaic
 from spikerig.dataset.errors import NumericsError, UsageError
 from spikerig.dataset.kernels import fire
+from spikerig.dataset.sim_kernels import fire_noisy
 from spikerig.rigctl.sim.effects import Hooks
 from spikerig.rigctl.sim.spec import Sensor
 
 Floats = NDArray[np.floating]  # float32 unless said
-BLOCK = 300_000  # pixel-ticks of light made at once where an effect needs every tick
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,15 +123,21 @@ def delayed(light: Floats, knots: NDArray[np.int64], by: NDArray[np.float64]) ->
 
 
 def spike_light(rgb: Floats, sensor: Sensor) -> Floats:
-    """Light as the spike pixels see it, in thresholds a tick: gain * (response . rgb), float32[K,H,W].
+    """Light as the spike pixels see it, in thresholds a tick, float32[K,H,W].
+
+    gain * (response . rgb); of a colour sensor gain * channel_gain * its own colour.
 
     Raises:
         NumericsError: a value is negative or not finite.
     """
-    k = np.array(sensor.response, np.float32) * np.float32(sensor.gain)
-    light = rgb[..., 0] * k[0]
-    light += rgb[..., 1] * k[1]
-    light += rgb[..., 2] * k[2]
+    if sensor.bayer is not None:
+        light = mosaic(rgb, sensor.bayer)
+        light *= np.float32(sensor.gain)
+    else:
+        k = np.array(sensor.response, np.float32) * np.float32(sensor.gain)
+        light = rgb[..., 0] * k[0]
+        light += rgb[..., 1] * k[1]
+        light += rgb[..., 2] * k[2]
     if not (np.min(light, initial=0) >= 0 and np.isfinite(np.max(light, initial=0))):
         bad = int(np.count_nonzero(~(light >= 0) | ~np.isfinite(light)))
         raise NumericsError("light must be finite and not negative", value=f"{bad} of {light.size} values are not")
@@ -138,7 +146,7 @@ def spike_light(rgb: Floats, sensor: Sensor) -> Floats:
 
 def integrate(
     light: Floats, knots: NDArray[np.int64], start: NDArray[np.float64], steps: Sequence[Hooks] = ()
-) -> tuple[NDArray[np.uint8], NDArray[np.uint32], NDArray[np.float64]]:
+) -> tuple[NDArray[np.uint8], NDArray[np.uint32] | NDArray[np.int64], NDArray[np.float64]]:
     """Integrate and fire (Eq. 5 and 6), the surplus kept, at most one spike a tick.
 
     Args:
@@ -148,44 +156,26 @@ def integrate(
         steps: hooks of the effects in stage order.
 
     Returns:
-        bits uint8[T,H,ceil(W/8)], charge left uint32[H,W] in 2^-32 thresholds, charge clipped float64[H,W] in
-        thresholds: in = fired + left + clipped.
+        bits uint8[T,H,ceil(W/8)]; charge left [H,W] in 2^-32 thresholds, uint32, or int64 where effects inside the
+        pixel can leave it below 0 or above one; charge lost (clipped, or gone in resets) float64[H,W] in thresholds:
+        in = fired + left + lost, `in` after shot noise.
+
+    Raises:
+        UsageError: two effects that set the same thing inside a pixel.
 
     Cost:
-        Without per-tick effects the light is only touched at its knots.
+        The light is only touched at its knots; effects inside the pixel cost what their kernel does.
     """
-    hooks = [h for h in steps if h.light is not None]
-    first = next((i for i, h in enumerate(hooks) if h.per_tick), len(hooks))
-    for h in hooks[:first]:
-        h.light(light)  # type: ignore[misc]
+    pixel: dict[str, Any] = {}
+    for h in steps:
+        if h.light is not None:
+            h.light(light)
+        twice = set(pixel) & set(h.pixel)
+        if twice:
+            raise UsageError("two effects set the same thing inside a pixel", value=", ".join(sorted(twice)))
+        pixel |= h.pixel
     charge = np.minimum(np.floor(start * 2.0**32), 2.0**32 - 1).astype(np.uint32)
     hold = len(knots) == len(light) + 1
-    if first == len(hooks):
-        return fire(light, knots, charge, hold=hold)
-    bits = np.empty((int(knots[-1] - knots[0]), light.shape[1], (light.shape[2] + 7) // 8), np.uint8)
-    clipped = np.zeros(light.shape[1:])
-    at = 0
-    for block in _ticks(light, knots, hold):
-        for h in hooks[first:]:
-            h.light(block)  # type: ignore[misc]
-        n = len(block)
-        bits[at : at + n], charge, lost = fire(block, np.arange(n + 1), charge, hold=True)
-        clipped += lost
-        at += n
-    return bits, charge, clipped
-
-
-def _ticks(light: Floats, knots: NDArray[np.int64], hold: bool) -> Iterable[Floats]:
-    """The light of every tick (at its midpoint), in blocks float32[n,H,W]."""
-    most = max(1, BLOCK // max(1, light[0].size))
-    for k in range(len(knots) - 1):
-        ticks = int(knots[k + 1] - knots[k])
-        for top in range(0, ticks, most):
-            n = min(most, ticks - top)
-            if hold:
-                yield np.repeat(light[k : k + 1], n, axis=0)
-            else:
-                w = ((np.arange(top, top + n) + 0.5) / ticks).astype(np.float32)[:, None, None]
-                block = (light[k + 1] - light[k]) * w
-                block += light[k]
-                yield block
+    if not set(pixel) - {"carry"}:
+        return fire(light, knots, charge, hold=hold, **pixel)
+    return fire_noisy(light, knots, charge, hold=hold, **pixel)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,26 +17,37 @@ from spikerig.rigctl.sim.rgb import encode, expose, optics
 from spikerig.rigctl.sim.sensor import Floats, Light, delayed, integrate, refined, spike_light
 from spikerig.rigctl.sim.spec import Sensor
 
+if TYPE_CHECKING:
+    from spikerig.dataset.events import EventStream
+    from spikerig.rigctl.sim.events import EventCamera
+
 
 @dataclass(frozen=True, slots=True)
 class Simulated:
     """One view as the cameras saw it, and what only the simulator knows.
 
-    Args:
-        spikes: over all of the light's ticks.
-        frame: sRGB, 8 bits.
-        blurry: float64[H,W,3], the exposure's mean linear light before any response.
-        start: float64[H,W], charge before the first tick, thresholds.
-        left: uint32[H,W], charge after the last tick, 2^-32 thresholds.
-        clipped: float64[H,W], charge beyond one spike a tick, thresholds.
+        Args:
+            spikes: over all of the light's ticks.
+            frame: sRGB, 8 bits.
+            blurry: float64[H,W,3], the exposure's mean linear light before any response.
+            start: float64[H,W], charge before the first tick, thresholds.
+    <<<<<<< HEAD
+            left: uint32[H,W], charge after the last tick, 2^-32 thresholds.
+            clipped: float64[H,W], charge beyond one spike a tick, thresholds.
+            events: of the event camera, None without one.
+    =======
+            left: uint32 or int64 [H,W], charge after the last tick, 2^-32 thresholds.
+            clipped: float64[H,W], charge beyond one spike a tick (or gone in a reset), thresholds.
+    >>>>>>> main
     """
 
     spikes: SpikeStream
     frame: Frame
     blurry: NDArray[np.float64]
     start: NDArray[np.float64]
-    left: NDArray[np.uint32]
+    left: NDArray[np.uint32] | NDArray[np.int64]
     clipped: NDArray[np.float64]
+    events: EventStream | None = None
 
 
 def simulate(
@@ -45,6 +57,7 @@ def simulate(
     seed: int,
     view: int = 0,
     camera: Camera | None = None,
+    events: EventCamera | None = None,
 ) -> Simulated:
     """Spikes and a blurry frame of one view.
 
@@ -55,6 +68,7 @@ def simulate(
         seed: of the scene; every effect draws from its own stream of (seed, name, view).
         view: number of the view.
         camera: the pinhole of both arms, for effects that need angles.
+        events: an event camera in the spike camera's place: the same light, behind the same optics.
 
     Raises:
         UsageError: an effect is listed twice.
@@ -69,12 +83,14 @@ def simulate(
         raise UsageError("an effect is listed twice", value=", ".join(sorted(n for n in names if names.count(n) > 1)))
     height, width = light.rgb.shape[1:3]
     ticks = int(light.knots[-1] - light.knots[0])
-    site = Site(height, width, view, seed, light.rate_hz, light.t0_ns * 1e-9, ticks, camera)
+    own_arm = light.arm is not None
+    site = Site(height, width, view, seed, light.rate_hz, light.t0_ns * 1e-9, ticks, camera, own_arm)
     steps = [effect.begin(site) for effect in in_order(effects)]
     light = _lit(light, steps)
     spikes, start, left, clipped = _spikes(light, sensor, steps)
     frame, blurry = _frame(light, steps)
-    return Simulated(spikes, frame, blurry, start, left, clipped)
+    seen = None if events is None else _events(light, sensor, steps, events, seed, view)
+    return Simulated(spikes, frame, blurry, start, left, clipped, seen)
 
 
 def _lit(light: Light, steps: Sequence[Hooks]) -> Light:
@@ -94,12 +110,10 @@ def _lit(light: Light, steps: Sequence[Hooks]) -> Light:
 
 def _spikes(
     light: Light, sensor: Sensor, steps: Sequence[Hooks]
-) -> tuple[SpikeStream, NDArray[np.float64], NDArray[np.uint32], NDArray[np.float64]]:
+) -> tuple[SpikeStream, NDArray[np.float64], NDArray[np.uint32] | NDArray[np.int64], NDArray[np.float64]]:
     """The spike arm: stream, charge before, charge left, charge clipped."""
     height, width = light.rgb.shape[1:3]
-    seen = spike_light(light.rgb, sensor)
-    seen = optics(seen[..., None], [h.spike_optics for h in steps])[..., 0]
-    seen, knots = delayed(seen, light.knots, _ahead(light, [h.clock_ns for h in steps]))
+    seen, knots = delayed(_arrived(light, sensor, steps), light.knots, _ahead(light, [h.clock_ns for h in steps]))
     start = np.zeros((height, width))
     for h in steps:
         if h.charge is not None:
@@ -113,6 +127,24 @@ def _spikes(
         if h.wire is not None:
             stream = h.wire(stream)
     return stream, start, left, clipped
+
+
+def _arrived(light: Light, sensor: Sensor, steps: Sequence[Hooks]) -> Floats:
+    """Light on the pixels behind the spike arm's optics, float32[K,H,W]."""
+    changes = [h.spike_optics for h in steps]
+    if sensor.bayer is not None:  # optics mix pixels, so they come before colours part
+        return spike_light(optics(light.rgb, changes), sensor)
+    return optics(spike_light(light.rgb, sensor)[..., None], changes)[..., 0]
+
+
+def _events(
+    light: Light, sensor: Sensor, steps: Sequence[Hooks], camera: EventCamera, seed: int, view: int
+) -> EventStream:
+    """The event camera in the spike camera's place: it sees gray, with faults of its own."""
+    from spikerig.rigctl.sim.events import simulate_events
+
+    gray = _arrived(light, replace(sensor, gain=1.0, colour="mono"), steps)
+    return simulate_events(gray, light.knots, light.rate_hz, camera, seed, view, t0_ns=light.t0_ns)
 
 
 def _ahead(light: Light, clocks: Sequence) -> NDArray[np.float64]:

@@ -8,16 +8,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from spikerig.dataset.bayer import PATTERNS, Bayer
 from spikerig.dataset.errors import RigError, UsageError
 from spikerig.rigctl.sim.effects import Effect, effect_class, in_order, read_effects
 from spikerig.rigctl.sim.limits import Faults, limits, nearest, read_record
 from spikerig.rigctl.sim.orbit import Orbit, orbit_pose
 from spikerig.rigctl.sim.presets import PRESETS, preset_effects, preset_names
 from spikerig.rigctl.sim.world import Vec3, World, read_world, stands_in
+
+if TYPE_CHECKING:
+    from spikerig.rigctl.sim.events import EventCamera
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,13 +99,24 @@ class Sensor:
         preset: a published spike camera: its effects become those to choose from, its settings the defaults.
         map: with `vidar-map`, the sensor's own maps (.npz; see effect `sensor_map`); its path from the scene file.
         gain: spikes a tick at RGB white (1 / threshold in the paper's units); 0.4, or 0.5 for `paper`.
-        response: of the spike camera to linear red, green and blue.
+        response: of the spike camera to linear red, green and blue, where its colour is `mono`.
+        colour: `mono`, or `bayer`: each pixel sees one colour only.
+        pattern: of `bayer`, the colours of the first two pixels of the first two rows.
+        channel_gain: of `bayer`, of red, green and blue pixels, times `gain`.
     """
 
     preset: str = limits("", choices=preset_names("spike"))
     map: str = limits("", unit="a .npz file")
     gain: float = limits(0.4, 1e-9, 1e9, "spikes a tick at white")
     response: Vec3 = limits((0.299, 0.587, 0.114), 0, 100)
+    colour: str = limits("mono", choices=("mono", "bayer"))
+    pattern: str = limits("rggb", choices=PATTERNS)
+    channel_gain: Vec3 = limits((1.0, 1.0, 1.0), 1e-6, 1e6)
+
+    @property
+    def bayer(self) -> Bayer | None:
+        """The colours of its pixels; None where each sees all."""
+        return Bayer(self.pattern, self.channel_gain) if self.colour == "bayer" else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,6 +163,7 @@ class Settings:
     effects: tuple[Effect, ...]
     rgb: RgbCamera = RgbCamera()
     tolerance: Tolerance | None = None
+    events: EventCamera | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,6 +173,7 @@ class SceneSpec:
     Args:
         effects: in the order in which they act: those to simulate, or with a tolerance those to choose from.
         tolerance: of `effects = "auto"`; None once the effects are chosen, or were listed.
+        events: an event camera in the spike camera's place; None without.
         others: as in the file.
     """
 
@@ -172,6 +189,7 @@ class SceneSpec:
     effects: tuple[Effect, ...]
     rgb: RgbCamera = RgbCamera()
     tolerance: Tolerance | None = None
+    events: EventCamera | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,6 +202,7 @@ class _Top:
     exposure: Any = limits({})
     sensor: Any = limits({})
     rgb: Any = limits({})
+    events: Any = limits(None)
     points: Any = limits({})
 
 
@@ -249,8 +268,19 @@ def _settings(top: _Top, faults: Faults) -> Settings:
     _check_exposure(exposure, faults)
     if sum(sensor.response) <= 0:
         faults.add("sensor.response", "is all zero: the spike camera would be blind")
+    for name in ("pattern", "channel_gain") if sensor.colour == "mono" else ():
+        if isinstance(top.sensor, Mapping) and name in top.sensor:
+            faults.add(f"sensor.{name}", 'is for colour = "bayer"; this sensor sees gray')
     auto = tolerance if top.effects == "auto" else None
-    return Settings(top.name, top.seed, exposure, sensor, cloud, effects, rgb, auto)
+    return Settings(top.name, top.seed, exposure, sensor, cloud, effects, rgb, auto, _event_camera(top.events, faults))
+
+
+def _event_camera(table: Any, faults: Faults) -> EventCamera | None:
+    if table is None:
+        return None
+    from spikerig.rigctl.sim.events import EventCamera
+
+    return read_record(EventCamera, table, "events", faults)
 
 
 def _sensor_defaults(table: Any, paper: bool) -> Mapping[str, Any]:
@@ -277,9 +307,10 @@ def _effects(top: _Top, presets: list[Mapping[str, Any]], phase: str, faults: Fa
     for name, effect in found.items():
         for other in set(getattr(effect, "excludes", ())) & set(found):
             faults.add("effects", f"list {name} and {other}: the same thing would count twice")
-        if hasattr(effect, "placed"):
+        placed = getattr(effect, "placed", None)
+        if placed is not None:
             try:
-                found[name] = effect.placed(Path(faults.source).parent)
+                found[name] = placed(Path(faults.source).parent)
             except RigError as error:
                 faults.add(f"effects.{name}", f"{error.what}: {error.value}")
     return in_order(found.values())
@@ -312,6 +343,7 @@ def read_scene(table: Mapping[str, Any], source: str = "the scene") -> SceneSpec
         effects=settings.effects,
         rgb=settings.rgb,
         tolerance=settings.tolerance,
+        events=settings.events,
     )
     if not faults.found:
         _check_views(spec, faults)
@@ -326,6 +358,7 @@ def _check_views(spec: SceneSpec, faults: Faults) -> None:
         faults.add("exposure.sub_poses", f"is {n}, more than fit the {spec.exposure.ticks} ticks of an exposure")
     if spec.shake.path_px[0] > spec.shake.path_px[1]:
         faults.add("shake.path_px", f"is {list(spec.shake.path_px)}, expected [low, high]")
+    _check_rows(spec, faults)
     for k in orbit.test:
         if k != int(k) or k >= orbit.views:
             faults.add("orbit.test", f"holds {k:g}, expected view numbers 0 to {orbit.views - 1}")
@@ -337,6 +370,21 @@ def _check_views(spec: SceneSpec, faults: Faults) -> None:
         if trouble:
             faults.add("orbit", f"view {number} stands {trouble}")
             return
+
+
+def _check_rows(spec: SceneSpec, faults: Faults) -> None:
+    """Rows of a rolling shutter must be exposed within the margins."""
+    rolling: Any = next((e for e in spec.effects if e.name == "rolling_shutter"), None)
+    height, exposure = spec.lens.height, spec.exposure
+    if rolling is None:
+        return
+    needed = rolling.row_ns(height) * (height // 2) / exposure.tick_ns
+    if needed > exposure.margin_ticks:
+        faults.add(
+            "exposure.margin_ticks",
+            f"is {exposure.margin_ticks}, but rolling_shutter exposes the first row {needed:.4g} ticks before "
+            "the middle one: raise it, or lower readout_ms",
+        )
 
 
 def with_changes(spec: SceneSpec, *, seed: int | None = None, views: int | None = None) -> SceneSpec:

@@ -47,7 +47,7 @@ def survey(
         A few passes over the pictures of each view.
     """
     parts = [_facts(look, sensor) for look in looks]
-    pixels = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    pixels = {key: np.concatenate([rows[key] for rows, _ in parts]) for key in parts[0][0]}
     return Facts(
         **pixels,
         ticks=exposure.ticks,
@@ -58,10 +58,14 @@ def survey(
         views=views,
         period_s=exposure.period_ms * 1e-3,
         depth=depth,
+        looks=tuple(look.light for look in looks),
+        means=tuple(mean for _, mean in parts),
+        response=(sensor.gain * sensor.response[0], sensor.gain * sensor.response[1], sensor.gain * sensor.response[2]),
     )
 
 
-def _facts(look: Look, sensor: Sensor) -> dict[str, Any]:
+def _facts(look: Look, sensor: Sensor) -> tuple[dict[str, Any], tuple[Floats, Floats]]:
+    """Of one view: what is known of its sampled pixels, and the exposure's means."""
     light = look.light
     weights = window_weights(light, np.array([float(light.exposure[0])]))[0]
     inside = np.flatnonzero(weights)
@@ -88,7 +92,8 @@ def _facts(look: Look, sensor: Sensor) -> dict[str, Any]:
     step = max(1, height * width // PIXELS)  # a stride that shares no factor with the width looks at every column
     while step > 1 and np.gcd(step, width) > 1:
         step += 1
-    return {key: np.asarray(a, np.float64).reshape(height * width, *a.shape[2:])[::step] for key, a in rows.items()}
+    pixels = {key: np.asarray(a, np.float64).reshape(height * width, *a.shape[2:])[::step] for key, a in rows.items()}
+    return pixels, (np.asarray(mean, np.float64), np.asarray(rgb, np.float64))
 
 
 def steepest(picture: Floats) -> Floats:

@@ -72,6 +72,24 @@ def test_blenders_combined_is_the_picture(tmp_path: Path) -> None:
         read_exr(two)
 
 
+def test_a_vector_is_neither_gray_nor_depth(tmp_path: Path) -> None:
+    """Blender 5 writes a part for each pass, with bare channel names."""
+    n, rgb, z = planes(3), planes(3), planes(1)[0]
+    passes = {
+        "Normal": dict(zip("XYZ", n, strict=True)),
+        "Glossy": dict(zip("RGB", planes(3), strict=True)),
+        "Combined": dict(zip("RGB", rgb, strict=True)),
+        "Depth": {"Z": z},
+    }
+    kind = OpenEXR.scanlineimage
+    parts = [OpenEXR.Part({"type": kind}, channels, f"View Layer.{name}") for name, channels in passes.items()]
+    OpenEXR.File(parts).write(str(tmp_path / "x.exr"))
+    np.testing.assert_array_equal(read_exr(tmp_path / "x.exr"), np.dstack(rgb))
+    np.testing.assert_array_equal(read_exr_depth(tmp_path / "x.exr"), z)
+    with pytest.raises(DataError, match="no RGB"):
+        read_exr(save(tmp_path / "n.exr", dict(zip("XYZ", n, strict=True))))
+
+
 def test_parts_and_views(tmp_path: Path) -> None:
     def part(name: str, view: str, channels: dict[str, np.ndarray]) -> Any:
         return OpenEXR.Part({"type": OpenEXR.scanlineimage, "view": view}, channels, name)

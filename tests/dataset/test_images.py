@@ -9,6 +9,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from spikerig.dataset.bayer import ColourTexture
 from spikerig.dataset.errors import DataError, NumericsError, UsageError
 from spikerig.dataset.images import (
     linear_from_srgb,
@@ -215,6 +216,16 @@ def test_writing_refuses_what_would_lose_something(tmp_path: Path) -> None:
     write_image(tmp_path / "x.png", np.ones((4, 4), np.uint8), force=True)
     assert read_image(tmp_path / "x.png").all()
     assert os.listdir(tmp_path) == ["x.png"]
+
+
+def test_the_png_of_a_texture_in_colour(tmp_path: Path) -> None:
+    light = np.random.default_rng(0).random((5, 6, 3)).astype(np.float32)
+    known = np.ones((5, 6, 3), bool)
+    texture_png(tmp_path / "a.png", ColourTexture(light, known, 3, "tfp"), 0.8)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), srgb8_from_linear(np.float32(0.8) * light))
+    known[2, 3, 1] = False
+    texture_png(tmp_path / "b.png", ColourTexture(light * known, known, 3, "tfp"), 0.8)
+    np.testing.assert_array_equal(read_image(tmp_path / "b.png")[:, :, 3] == 255, known.all(2))
 
 
 def test_the_png_of_a_texture(tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 """The native spike kernels equal their oracles, on every instruction set and for any number of threads."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -199,6 +201,32 @@ def test_fire_carries_no_more_than_fits(isa):
     assert clipped[0, 0] > 0
     assert clipped[0, 2] == 0
     assert kernels.count(bits, 3, 0, 70).tolist() == [[70, 70, 70]]
+
+
+@pytest.mark.parametrize("carry", [False, True])
+@pytest.mark.parametrize("hold", [False, True])
+@pytest.mark.parametrize("cuts", [[-5, -5, 0, 1, 63, 64, 200, 300], [-5, 150, 300], [-5, 299, 300]])
+def test_fire_in_spans_gives_the_bits_of_the_whole(isa, hold, carry, cuts):
+    light, knots = light_rows(5, (3, 141), np.float32(1.4)), np.array([-5, 0, 70, 71, 300])
+    start = np.random.default_rng(5).integers(0, 2**32, (3, 141), dtype=np.uint32)
+    whole = kernels.fire(light, knots, start, hold=hold, carry=carry)
+    charge, parts, clipped = start, [], np.zeros((3, 141))
+    for span in itertools.pairwise(cuts):
+        mine = kernels.fire(light, knots, charge, hold=hold, span=span, carry=carry)
+        true = oracles.fire(light, knots, charge, hold=hold, span=span, carry=carry)
+        assert all(np.array_equal(a, b) for a, b in zip(mine, true, strict=True))
+        parts.append(mine[0])
+        charge, clipped = mine[1], clipped + mine[2]
+    assert np.array_equal(np.concatenate(parts), whole[0])
+    assert np.array_equal(charge, whole[1])
+    assert np.allclose(clipped, whole[2], rtol=1e-14)
+
+
+def test_fire_refuses_spans_outside_the_knots():
+    light, start = np.full((1, 2, 9), 0.5, np.float32), np.zeros((2, 9), np.uint32)
+    for span in ((-1, 3), (2, 1), (0, 5)):
+        with pytest.raises(UsageError, match="span"):
+            kernels.fire(light, np.array([0, 4]), start, hold=True, span=span)
 
 
 def test_fire_needs_no_last_row_to_hold():

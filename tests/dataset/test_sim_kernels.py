@@ -1,10 +1,12 @@
 """Firing with noise: the native kernel against its oracle, and the physics of each effect."""
 
+import itertools
+
 import numpy as np
 import pytest
 
 from spikerig import _native
-from spikerig.dataset import kernels, sim_kernels, sim_oracles
+from spikerig.dataset import kernels, oracles, sim_kernels, sim_oracles
 from spikerig.dataset.errors import NumericsError, UsageError
 
 KNOTS = {
@@ -20,6 +22,7 @@ EFFECTS = {
     "comparator": {"comparator": (0.02, (5, 6))},
     "loud comparator": {"comparator": (0.7, (2**32 - 1, 6)), "carry": True},
     "loss": {"reset_loss": 0.3},
+    "deaf": {"reset_loss": 1.0},
     "all": {"shot": (40.0, (1, 2)), "comparator": (0.1, (2, 1)), "reset_loss": 0.002, "first_tick": 2**40 + 3},
 }
 
@@ -78,18 +81,18 @@ def test_without_noise_it_is_fire(isa, carry):
         assert np.array_equal(a, b)
 
 
-@pytest.mark.parametrize("pieces", [[1] * 60, [7, 13, 40], [59, 1], [4, 56]])
-def test_blocks_of_any_length_give_the_same_bits(isa, pieces):
-    light, charge = light_rows(1, (4, 70), 1.5), starts((4, 70))
-    effects = EFFECTS["all"] | {"first_tick": -10}
-    whole = sim_kernels.fire_noisy(light, np.array([0, 60]), charge, hold=True, **effects)
-    bits, before, tick, lost = [], None, -10, 0.0
-    for n in pieces:
+@pytest.mark.parametrize("cuts", [range(-10, 51), [-10, -3, 10, 50], [-10, 49, 50], [-10, -6, 50]])
+def test_spans_of_any_length_give_the_same_bits(isa, cuts):
+    light, charge, knots = light_rows(4, (4, 70), 1.5), starts((4, 70)), np.array([-10, 1, 22, 50])
+    effects = {"shot": (40.0, (1, 2)), "comparator": (0.1, (2, 1)), "reset_loss": 0.1}
+    whole = sim_kernels.fire_noisy(light, knots, charge, hold=False, **effects)
+    bits, before, lost = [], None, 0.0
+    for span in itertools.pairwise(cuts):
         part, charge, gone = sim_kernels.fire_noisy(
-            light, np.array([0, n]), charge, hold=True, before=before, **effects | {"first_tick": tick}
+            light, knots, charge, hold=False, span=span, before=before, **effects
         )
         bits.append(part)
-        before, tick, lost = part[-1], tick + n, lost + gone
+        before, lost = part[-1], lost + gone
     assert np.array_equal(np.concatenate(bits), whole[0])
     assert np.array_equal(charge, whole[1])
     assert np.allclose(lost, whole[2], rtol=1e-15)
@@ -118,7 +121,7 @@ def test_charge_is_conserved(carry):
     bits, after, lost = sim_kernels.fire_noisy(
         light, knots, charge, hold=False, comparator=(0.2, (1, 2)), reset_loss=0.01, carry=carry
     )
-    put_in = sim_oracles.fixed_light(light, knots, hold=False).sum(0)
+    put_in = oracles.fixed_light(light, knots, hold=False).sum(0)
     assert np.array_equal(total_charge(bits, 50, after, charge, lost), put_in)
     assert lost.max() > (0 if carry else 1)
 
@@ -189,7 +192,7 @@ def test_reset_loss_takes_its_share_of_ticks_after_spikes():
 def test_what_is_refused():
     light, knots, start = np.full((1, 2, 9), 0.5, np.float32), np.array([0, 3]), np.zeros((2, 9), np.int64)
     for bad in (
-        {"reset_loss": 1.0},
+        {"reset_loss": 1.01},
         {"reset_loss": -0.1},
         {"reset_loss": np.nan},
         {"comparator": (1.5, (1, 2))},

@@ -46,6 +46,20 @@ def test_everything_round_trips_to_the_last_bit(scene: Path) -> None:
         assert (file.status, file.has_truth, file.truth_label) == ("complete", True, "first")
 
 
+def test_a_frame_of_more_than_eight_bits_round_trips(tmp_path: Path) -> None:
+    whole, first = full_scene(), view(0)
+    deep = np.random.default_rng(0).integers(0, 65536, first.frame.pixels.shape, np.uint16)
+    first = replace(first, frame=replace(first.frame, pixels=deep))
+    write_scene(tmp_path / "deep.h5", replace(whole, views=(first, *whole.views[1:])))
+    with open_scene(tmp_path / "deep.h5") as file:
+        frame = file.view("a").frame
+    assert (frame.pixels.dtype, frame.full) == (np.uint16, 65535)
+    assert np.array_equal(frame.pixels, deep)
+    assert frame.pixels8.dtype == np.uint8
+    assert np.abs(frame.pixels8 - deep / 257).max() <= 0.5
+    assert not verify_scene(tmp_path / "deep.h5")
+
+
 def test_the_least_scene_round_trips(tmp_path: Path) -> None:
     least = Scene("s", Camera.pinhole(21, 13, 40.0), (replace(view(1), spikes=None),))
     write_scene(tmp_path / "s.h5", least)

@@ -10,6 +10,7 @@ from hard_sim import small, steady
 
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.kernels import count
+from spikerig.dataset.scene import Camera
 from spikerig.rigctl.sim.effects import EFFECTS, Effect, Hooks, Site, Stage, effect_class, in_order
 from spikerig.rigctl.sim.effects.dark import DarkCurrent
 from spikerig.rigctl.sim.effects.fpn import ThresholdFpn
@@ -72,10 +73,10 @@ def test_an_effect_left_out_is_not_imported() -> None:
 
 
 def test_an_effect_left_out_is_not_called(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a per-tick effect, light is only touched at its knots."""
+    """Without an effect inside the pixel, the noisy kernel does not run."""
     import spikerig.rigctl.sim.sensor as sensor
 
-    monkeypatch.setattr(sensor, "_ticks", lambda *a: pytest.fail("light was made for every tick"))
+    monkeypatch.setattr(sensor, "fire_noisy", lambda *a, **k: pytest.fail("the kernel that draws every tick"))
     run(DarkCurrent(), ThresholdFpn(), InitialPhase(), ReadNoise())
     with pytest.raises(BaseException, match="every tick"):
         run(ShotNoise())
@@ -156,7 +157,7 @@ def test_every_effect_says_what_it_is() -> None:
             assert len(word) > 3
         for field in fields(effect):
             assert field.metadata["unit"], (name, field.name)
-        hooks = effect.begin(Site(2, 3, 0, 0))
+        hooks = effect.begin(Site(2, 3, 0, 0, camera=Camera.pinhole(3, 2, 60)))
         assert hooks != Hooks()
 
 

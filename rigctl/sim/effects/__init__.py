@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,7 @@ class Site:
         t0_s: the rig's time at the first tick of the view, seconds from the start of the take.
         ticks: of the view's spikes, margins included.
         camera: the pinhole that both arms share before any misalignment.
+        own_arm: the RGB arm's light was cast from its own pose already.
     """
 
     height: int
@@ -63,6 +64,7 @@ class Site:
     t0_s: float = 0.0
     ticks: int = 1
     camera: Camera | None = None
+    own_arm: bool = False
 
     def draw(self, effect: str) -> np.random.Generator:
         """The effect's own stream for this view."""
@@ -91,7 +93,6 @@ class Hooks:
         rgb_optics: the same for the RGB arm; it may see the exposure's mean instead of its samples.
         light: changes light [n,H,W] in place, in thresholds a tick; affine in the light and the same for all ticks, so
             that it may act on knots; each gets what those before it left.
-        per_tick: `light` must see every tick instead; slow, for effects that `pixel` does not know.
         pixel: arguments of the kernel `fire_noisy`, for what differs from tick to tick inside a pixel.
         charge: changes the initial charge float64[H,W] in place, in thresholds.
         bits: (bits uint8[T,H,B], width) changes spikes in place, before they leave the sensor.
@@ -111,7 +112,6 @@ class Hooks:
     spike_optics: Callable[[Floats], Floats] | None = None
     rgb_optics: Callable[[Floats], Floats] | None = None
     light: Callable[[Floats], None] | None = None
-    per_tick: bool = False
     pixel: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     charge: Callable[[NDArray[np.float64]], None] | None = None
     bits: Callable[[NDArray[np.uint8], int], None] | None = None
@@ -135,12 +135,12 @@ class Effect(Protocol):
     effect with its file found from the folder of the scene file (or a RigError).
     """
 
-    name: str
-    stage: Stage
-    per: str
-    source: str
-    vanishes: str
-    cost_ns: float
+    name: ClassVar[str]
+    stage: ClassVar[Stage]
+    per: ClassVar[str]
+    source: ClassVar[str]
+    vanishes: ClassVar[str]
+    cost_ns: ClassVar[float]
 
     def begin(self, site: Site) -> Hooks:
         """Ready for one view."""
@@ -154,6 +154,15 @@ class Effect(Protocol):
 # name -> module and class. A table, not a registry: importing this module imports no effect.
 # Effects of one stage act in the order of the table.
 EFFECTS: Mapping[str, tuple[str, str]] = {
+    "flicker": ("flicker", "Flicker"),
+    "brightness_ramp": ("ramp", "BrightnessRamp"),
+    "splitter": ("splitter", "Splitter"),
+    "misalignment": ("misalignment", "Misalignment"),
+    "ghost": ("ghost", "Ghost"),
+    "mirror_flip": ("flip", "MirrorFlip"),
+    "distortion": ("distortion", "Distortion"),
+    "defocus": ("defocus", "Defocus"),
+    "vignetting": ("vignetting", "Vignetting"),
     "shot_noise": ("shot", "ShotNoise"),
     "prnu": ("prnu", "Prnu"),
     "sensor_map": ("maps", "SensorMap"),
@@ -174,7 +183,15 @@ EFFECTS: Mapping[str, tuple[str, str]] = {
     "clock_wander": ("clock", "ClockWander"),
     "clock_jitter": ("clock", "ClockJitter"),
     "clock_reset": ("clock", "ClockReset"),
+    "rolling_shutter": ("rolling", "RollingShutter"),
+    "rgb_noise": ("rgb_noise", "RgbNoise"),
+    "bayer": ("bayer", "Bayer"),
+    "white_balance": ("balance", "WhiteBalance"),
+    "response_curve": ("response", "ResponseCurve"),
     "read_noise": ("read", "ReadNoise"),
+    "bit_depth": ("bits", "BitDepth"),
+    "jpeg": ("jpeg", "Jpeg"),
+    "video_codec": ("video", "VideoCodec"),
 }
 
 

@@ -30,12 +30,12 @@ class LostBlocks:
 
     name: ClassVar[str] = "lost_blocks"
     stage: ClassVar[Stage] = Stage.WIRE
-    per: ClassVar[str] = "frame"
+    per: ClassVar[str] = "tick"
     source: ClassVar[str] = (
         "SpikeCV's SDK drops whole blocks (cusum 50 ticks) when a buffer is full; the chance is ours"
     )
     vanishes: ClassVar[str] = "chance = 0"
-    cost_ns: ClassVar[float] = 0.1
+    cost_ns: ClassVar[float] = 0.01
 
     def begin(self, site: Site) -> Hooks:
         """Losses of one view."""

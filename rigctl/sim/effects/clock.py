@@ -41,7 +41,7 @@ class ClockOffset:
     per: ClassVar[str] = "knot"
     source: ClassVar[str] = "SpikeNVS: the clock box aligns the cameras to 0.0001 s"
     vanishes: ClassVar[str] = "offset_us = frame_us = 0"
-    cost_ns: ClassVar[float] = 2.0
+    cost_ns: ClassVar[float] = 4.0
 
     def begin(self, site: Site) -> Hooks:
         """The same at all times."""
@@ -67,11 +67,11 @@ class ClockSkew:
     per: ClassVar[str] = "knot"
     source: ClassVar[str] = "crystal oscillators without temperature control: 10 to 50 ppm by their data sheets"
     vanishes: ClassVar[str] = "ppm = 0"
-    cost_ns: ClassVar[float] = 2.0
+    cost_ns: ClassVar[float] = 4.0
 
     def begin(self, site: Site) -> Hooks:
         """In proportion to the time."""
-        return Hooks(clock_ns=lambda at_ns: at_ns * (self.ppm * 1e-6))
+        return Hooks(clock_ns=lambda at_ns: at_ns.astype(np.float64) * (self.ppm * 1e-6))
 
     def magnitude(self, facts: Facts) -> Bound:
         """As an offset of ppm x the take's length: the last view's."""
@@ -93,7 +93,7 @@ class ClockWander:
     per: ClassVar[str] = "knot"
     source: ClassVar[str] = "white frequency noise (IEEE 1139): sd(t) = sigma sqrt(t); the size is ours"
     vanishes: ClassVar[str] = "sd_us = 0"
-    cost_ns: ClassVar[float] = 2.0
+    cost_ns: ClassVar[float] = 4.0
 
     def begin(self, site: Site) -> Hooks:
         """The path at any time; views share it."""
@@ -125,7 +125,7 @@ class ClockJitter:
     per: ClassVar[str] = "knot"
     source: ClassVar[str] = "stamps made by the host when a block arrives (SpikeCV's SDK); the size is ours: one tick"
     vanishes: ClassVar[str] = "sd_us = frame_us = 0"
-    cost_ns: ClassVar[float] = 2.0
+    cost_ns: ClassVar[float] = 4.0
 
     def begin(self, site: Site) -> Hooks:
         """The view's amounts."""
@@ -154,7 +154,7 @@ class ClockReset:
     per: ClassVar[str] = "knot"
     source: ClassVar[str] = "a camera or clock box that starts anew within a take; the size is ours"
     vanishes: ClassVar[str] = "jump_us = 0, or a view that the take does not have"
-    cost_ns: ClassVar[float] = 2.0
+    cost_ns: ClassVar[float] = 4.0
 
     def begin(self, site: Site) -> Hooks:
         """Nothing before the jump, all of it after."""

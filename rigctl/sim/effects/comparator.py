@@ -30,7 +30,7 @@ class ComparatorNoise:
     per: ClassVar[str] = "tick"
     source: ClassVar[str] = "SCSim (arXiv 2304.03129), v2s.py: sd 0.00636 V of a swing of 1.0924 V, 0.58 %"
     vanishes: ClassVar[str] = "sd = 0"
-    cost_ns: ClassVar[float] = 5.0
+    cost_ns: ClassVar[float] = 2.2
 
     def begin(self, site: Site) -> Hooks:
         """The kernel's noise of one view."""

@@ -29,7 +29,7 @@ class DarkCurrent:
     per: ClassVar[str] = "knot"
     source: ClassVar[str] = "SCSim (arXiv 2304.03129): 0.47 % of the threshold a tick, sd 0.18 %"
     vanishes: ClassVar[str] = "rate = sd = 0"
-    cost_ns: ClassVar[float] = 0.4
+    cost_ns: ClassVar[float] = 1.3
 
     def begin(self, site: Site) -> Hooks:
         """The sensor's dark charge."""

@@ -30,7 +30,7 @@ class BitFlips:
     per: ClassVar[str] = "tick"
     source: ClassVar[str] = "a raw raster has no checksum (docs/format.md); the chance is ours"
     vanishes: ClassVar[str] = "chance = 0"
-    cost_ns: ClassVar[float] = 0.02
+    cost_ns: ClassVar[float] = 0.07
 
     def begin(self, site: Site) -> Hooks:
         """Errors of one view."""

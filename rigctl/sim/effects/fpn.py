@@ -27,7 +27,7 @@ class ThresholdFpn:
     per: ClassVar[str] = "knot"
     source: ClassVar[str] = "SCSim (arXiv 2304.03129): 4.5 %; SpikingSIM real_spike: at most 3.7 % rms"
     vanishes: ClassVar[str] = "sd = 0"
-    cost_ns: ClassVar[float] = 0.5
+    cost_ns: ClassVar[float] = 1.2
 
     def begin(self, site: Site) -> Hooks:
         """The sensor's thresholds."""

@@ -31,7 +31,7 @@ class HotPixels:
         "RSIR's dark map: median 7.7, most 382 lux equivalent, 0.19 spikes a tick; the share is ours"
     )
     vanishes: ClassVar[str] = "share = 0 or rate = 0"
-    cost_ns: ClassVar[float] = 0.02
+    cost_ns: ClassVar[float] = 0.3
 
     def begin(self, site: Site) -> Hooks:
         """The sensor's hot pixels."""

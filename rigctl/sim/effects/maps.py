@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.errors import DataError
 from spikerig.rigctl.sim.effects import Floats, Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import Bound, Facts
+from spikerig.rigctl.sim.facts import Bound, Facts, surplus
 from spikerig.rigctl.sim.limits import limits
 
 MOST_PIXELS = 1 << 26
@@ -47,8 +47,8 @@ class SensorMap:
     stage: ClassVar[Stage] = Stage.CHARGE
     per: ClassVar[str] = "knot"
     source: ClassVar[str] = "the sensor's own flat fields; RSIR (MM 2023) calibrates the same two maps"
-    vanishes: ClassVar[str] = "gain = 1, dark = 0, no noise"
-    cost_ns: ClassVar[float] = 0.9
+    vanishes: ClassVar[str] = "gain = 1, dark = 0, no noise; or no file"
+    cost_ns: ClassVar[float] = 2.0
     excludes: ClassVar[tuple[str, ...]] = ("prnu", "dark_current", "threshold_fpn")
 
     def placed(self, folder: Path) -> SensorMap:
@@ -59,6 +59,8 @@ class SensorMap:
 
     def begin(self, site: Site) -> Hooks:
         """The part of the maps that the picture covers."""
+        if not self.file:
+            return Hooks(light=lambda block: None)
         gain, dark, noise = cropped(read_maps(self.file), site.height, site.width, self.file)
 
         def light(block: Floats) -> None:
@@ -70,11 +72,13 @@ class SensorMap:
 
     def magnitude(self, facts: Facts) -> Bound:
         """Light x (gain - 1) + dark, over all pairs of light and a sample of the map; noise at both ends."""
+        if not self.file:
+            return Bound(0.0, 0.0, "no maps")
         gain, dark, noise = cropped(read_maps(self.file), *facts.size, self.file)
         n = max(1, -(-8192 // max(1, facts.light.size)))
         pick = np.random.default_rng(95).integers(0, gain.size, (n, facts.light.size))
-        after = np.clip(facts.light * gain.reshape(-1)[pick] + dark.reshape(-1)[pick], 0, 1)
-        moved = after - facts.rate
+        after = facts.light * gain.reshape(-1)[pick] + dark.reshape(-1)[pick]
+        moved = after - surplus(after, after + (facts.light_max - facts.light)) - facts.rate
         sd = 0.0 if noise is None else float(np.median(noise))
         start, end = (sd * (np.abs(z) + 2) for z in facts.normal(2)[:, :n])
         spikes = facts.counted(moved * facts.ticks + end - start, moved * facts.margin_ticks + start)

@@ -21,7 +21,7 @@ class InitialPhase:
     per: ClassVar[str] = "frame"
     source: ClassVar[str] = "SpikeCV video_to_spike: U(0, threshold)"
     vanishes: ClassVar[str] = "left out, or exposure.phase = zero: the paper's zero charge"
-    cost_ns: ClassVar[float] = 0.0
+    cost_ns: ClassVar[float] = 26.0
 
     def begin(self, site: Site) -> Hooks:
         """Charges of one view."""

@@ -27,7 +27,7 @@ class Prnu:
     per: ClassVar[str] = "knot"
     source: ClassVar[str] = "SCSim (arXiv 2304.03129), v2s.py: alpha N(1.0128, 0.0584), 5.8 %"
     vanishes: ClassVar[str] = "sd = 0"
-    cost_ns: ClassVar[float] = 0.5
+    cost_ns: ClassVar[float] = 1.3
 
     def begin(self, site: Site) -> Hooks:
         """The sensor's gains."""

@@ -18,14 +18,14 @@ class ResetLoss:
         loss: share of a tick that a reset takes.
     """
 
-    loss: float = limits(0.002, 0, 1, "of a tick's charge")
+    loss: float = limits(0.002, 0, 0.99, "of a tick's charge")
 
     name: ClassVar[str] = "reset_loss"
     stage: ClassVar[Stage] = Stage.CHARGE
     per: ClassVar[str] = "tick"
     source: ClassVar[str] = "SCSim (arXiv 2304.03129), v2s.py: x 0.998, a reset of 100 ns in a tick of 50 us"
     vanishes: ClassVar[str] = "loss = 0"
-    cost_ns: ClassVar[float] = 1.0
+    cost_ns: ClassVar[float] = 0.5
 
     def begin(self, site: Site) -> Hooks:
         """The kernel's share of charge lost."""

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from spikerig.rigctl.sim.effects import Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import Bound, Facts
+from spikerig.rigctl.sim.facts import Bound, Facts, surplus
 from spikerig.rigctl.sim.limits import limits
 
 
@@ -29,18 +29,17 @@ class Saturation:
     per: ClassVar[str] = "tick"
     source: ClassVar[str] = "SpikeCV, S-SDM and SpikingSIM: soft reset without a limit; one read-out a tick clips"
     vanishes: ClassVar[str] = "mode = clip, or light below one threshold a tick"
-    cost_ns: ClassVar[float] = 0.5
+    cost_ns: ClassVar[float] = 0.06
 
     def begin(self, site: Site) -> Hooks:
         """What the kernel does with the surplus."""
         return Hooks(pixel={"carry": True}) if self.mode == "carry" else Hooks()
 
     def magnitude(self, facts: Facts) -> Bound:
-        """The surplus (most light - 1) of exposure and margin; no more than ticks without a spike."""
+        """Light beyond one threshold a tick, of exposure and margin; no more than ticks without a spike."""
         if self.mode == "clip":
             return Bound(0.0, 0.0, "clip: as without")
-        surplus = np.maximum(facts.light_max - 1, 0)
+        beyond = surplus(facts.light, facts.light_max)
         ticks = facts.ticks + facts.margin_ticks
-        idle = np.clip(1 - facts.light + surplus, 0, 1) * facts.ticks
-        change = np.minimum(idle, surplus * ticks)
-        return Bound(facts.counted(change), 0.0, f"{facts.most(surplus):.3g} x {ticks}, at most idle ticks")
+        change = np.minimum((1 - facts.rate) * facts.ticks, beyond * ticks)
+        return Bound(facts.counted(change), 0.0, f"{facts.most(beyond):.3g} x {ticks}, at most idle ticks")
