@@ -20,6 +20,7 @@ from spikerig.dataset.errors import HostError, UsageError
 from spikerig.dataset.images import write_image
 from spikerig.dataset.scene import Camera
 
+CHILD = ("-m", "spikerig.calib.colmap_child")
 PATIENCE_S = 3600
 EXHAUSTIVE = 80  # pictures up to which every pair is matched
 
@@ -167,7 +168,7 @@ def colmap_camera(camera: Camera) -> dict[str, Any]:
 def run_child(job: Path, done: Callable[[str], None] = lambda step: None) -> None:
     """Run COLMAP's child process on a job file; its death is an error of ours, with the end of what it said."""
     env = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "spikerig.calib.colmap_child", str(job)]
+    command = [sys.executable, *CHILD, str(job)]
     log = job.with_name("stderr.txt")
     with log.open("wb") as errors:
         child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, stdin=subprocess.DEVNULL, env=env)
