@@ -69,8 +69,8 @@ def read_folder(
 
     Args:
         folder: with transforms.json.
-        settings: a TOML file with any of name, seed and the tables exposure, sensor, effects and points of a scene
-            file; None takes capture.toml of the folder, and defaults where that is missing.
+        settings: a TOML file with any of name, seed and the tables exposure, sensor, effects, events and points of a
+            scene file; None takes capture.toml of the folder, and defaults where that is missing.
         protocol, seed: in place of the settings'.
         bad_values: what becomes of NaN, infinite and negative values: refuse, zero or clip (see `pictures.mend`).
 
@@ -109,14 +109,19 @@ def read_folder(
     return Folder(rig, read, tuple(v for v in views if v is not None), background, points, layer, bad_values)
 
 
-def _settings(root: Path, file: str | Path | None, protocol: str, seed: int | None) -> Settings:
+def settings_table(root: Path, file: str | Path | None = None) -> dict[str, Any]:
+    """What the settings of a folder hold, not looked at yet: of the file given, or of capture.toml; else empty."""
     path = Path(file) if file is not None else root / "capture.toml"
-    table: dict[str, Any] = {}
-    if file is not None or path.exists():
-        try:
-            table = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-            raise UsageError("the settings cannot be read", value=f"{path}: {error}") from None
+    if file is None and not path.exists():
+        return {}
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise UsageError("the settings cannot be read", value=f"{path}: {error}") from None
+
+
+def _settings(root: Path, file: str | Path | None, protocol: str, seed: int | None) -> Settings:
+    path, table = Path(file) if file is not None else root / "capture.toml", settings_table(root, file)
     if protocol:
         exposure = table.get("exposure", {})
         table["exposure"] = {**exposure, "protocol": protocol} if isinstance(exposure, dict) else exposure

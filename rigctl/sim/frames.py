@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from spikerig.dataset.errors import DataError, RigError
 from spikerig.dataset.exr import read_exr_depth
 from spikerig.rigctl.sim.folder import Folder
+from spikerig.rigctl.sim.folder_plan import plan_folder, resolve_folder
 from spikerig.rigctl.sim.limits import Faults
 from spikerig.rigctl.sim.pictures import Bad, as_report, read_light
 from spikerig.rigctl.sim.points import read_points
@@ -100,6 +101,16 @@ def capture_folder(
     """
     faults = Faults("the pictures", DataError, "docs/sim_frames.md says what a picture may hold (--bad-values mends)")
     bad: list[Bad] = []
+    info: dict[str, Any] = {
+        "made_by": "spikerig sim frames",
+        "folder": folder.rig.name,
+        "bad_values": folder.bad_values,
+    }
+    told: dict[str, Any] = {}
+    if folder.settings.tolerance is not None:
+        plan = plan_folder(folder)
+        folder, told = resolve_folder(folder, plan), {"plan": plan.as_json(), "plan_line": plan.summary()}
+        info["plan"] = told["plan"]
     takes = in_parallel(take_sequence, folder, len(folder.views), workers)
 
     def good() -> Iterator[Taken]:
@@ -111,7 +122,6 @@ def capture_folder(
                 yield taken.taken
         faults.raise_any()
 
-    info = {"made_by": "spikerig sim frames", "folder": folder.rig.name, "bad_values": folder.bad_values}
     points = read_points(folder.points) if folder.points else None
     made = pack(path, folder.rig, good(), info=info, points=points, views=len(folder.views), force=force, done=done)
-    return made | {"bad_values": as_report(folder.bad_values, bad)}
+    return made | told | {"bad_values": as_report(folder.bad_values, bad)}

@@ -28,6 +28,7 @@ from spikerig.rigctl.sim.spec import SceneSpec, read_scene
 
 VARIANTS = ("scalar_rgb", "scalar_spectral", "llvm_ad_rgb", "llvm_ad_spectral", "cuda_ad_rgb", "cuda_ad_spectral")
 RECORD = "mitsuba.json"
+SUB_POSES = 17  # of an exposure, unless said: pictures cost seconds here, so their number does not follow the motion
 NOWHERE = {"solids": [{"kind": "rect", "centre": [0, 0, -1e6], "right": [1e-3, 0, 0], "up": [0, 1e-3, 0]}]}  # not empty
 UP = {  # our world (z up) from the scene's
     "z": np.eye(3),
@@ -103,6 +104,8 @@ def plan_scene(
     if seed is not None:
         table["seed"] = seed
     table.setdefault("name", scene.stem)
+    if isinstance(exposure := table.setdefault("exposure", {}), dict) and exposure.get("protocol") != "paper":
+        exposure.setdefault("sub_poses", SUB_POSES)
     spec = read_scene({**table, "world": NOWHERE}, str(path))
     faults = Faults(str(path))
     renderer = read_record(Renderer, {**own, **given} if isinstance(own, dict) else own, "mitsuba", faults)

@@ -26,19 +26,14 @@ if TYPE_CHECKING:
 class Simulated:
     """One view as the cameras saw it, and what only the simulator knows.
 
-        Args:
-            spikes: over all of the light's ticks.
-            frame: sRGB, 8 bits.
-            blurry: float64[H,W,3], the exposure's mean linear light before any response.
-            start: float64[H,W], charge before the first tick, thresholds.
-    <<<<<<< HEAD
-            left: uint32[H,W], charge after the last tick, 2^-32 thresholds.
-            clipped: float64[H,W], charge beyond one spike a tick, thresholds.
-            events: of the event camera, None without one.
-    =======
-            left: uint32 or int64 [H,W], charge after the last tick, 2^-32 thresholds.
-            clipped: float64[H,W], charge beyond one spike a tick (or gone in a reset), thresholds.
-    >>>>>>> main
+    Args:
+        spikes: over all of the light's ticks.
+        frame: sRGB, 8 bits.
+        blurry: float64[H,W,3], the exposure's mean linear light before any response.
+        start: float64[H,W], charge before the first tick, thresholds.
+        left: uint32 or int64 [H,W], charge after the last tick, 2^-32 thresholds.
+        clipped: float64[H,W], charge beyond one spike a tick (or gone in a reset), thresholds.
+        events: of the event camera, None without one.
     """
 
     spikes: SpikeStream

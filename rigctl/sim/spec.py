@@ -8,20 +8,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from spikerig.dataset.bayer import PATTERNS, Bayer
-from spikerig.dataset.errors import RigError, UsageError
-from spikerig.rigctl.sim.effects import Effect, effect_class, in_order, read_effects
+from spikerig.dataset.errors import UsageError
+from spikerig.rigctl.sim.effects import Effect, effect_class, in_order, read_effects, settled
+from spikerig.rigctl.sim.events import EventCamera
 from spikerig.rigctl.sim.limits import Faults, limits, nearest, read_record
 from spikerig.rigctl.sim.orbit import Orbit, orbit_pose
 from spikerig.rigctl.sim.presets import PRESETS, preset_effects, preset_names
 from spikerig.rigctl.sim.world import Vec3, World, read_world, stands_in
-
-if TYPE_CHECKING:
-    from spikerig.rigctl.sim.events import EventCamera
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +57,8 @@ class Exposure:
         protocol: `rig` (40 kHz over a real exposure) or `paper` (18 one-bit samples an exposure, threshold 2); a
             protocol only sets defaults.
         exposure_ms, rate_hz: their product is the ticks of an exposure, a whole number.
-        sub_poses: pictures cast over an exposure, ends included (`linear`) or one a slot (`hold`).
+        sub_poses: pictures cast over an exposure, ends included (`linear`) or one a slot (`hold`); 0 for as many as
+            the view's motion asks for, one every 0.25 px, which is the default with `effects = "auto"`.
         margin_ticks: spikes kept on each side of the exposure.
         light: between sub-poses the light is `linear` in time, or each `hold`s for its slot.
         label: the instant a view is labelled with and its sharp truth is cast: `mid` exposure, or its `first` sub-pose.
@@ -70,7 +69,7 @@ class Exposure:
     protocol: str = limits("rig", choices=("rig", "paper"))
     exposure_ms: float = limits(8.0, 1e-3, 1e5, "ms")
     rate_hz: float = limits(40_000.0, 1, 1e8, "Hz")
-    sub_poses: int = limits(17, 1, 100_000)
+    sub_poses: int = limits(17, 0, 100_000)
     margin_ticks: int = limits(256, 0, 1_000_000, "ticks")
     light: str = limits("linear", choices=("linear", "hold"))
     label: str = limits("mid", choices=("mid", "first"))
@@ -227,6 +226,11 @@ def load_scene_toml(path_or_name: str | Path) -> SceneSpec:
     Raises:
         UsageError: no such file or name, not TOML, unknown keys, wrong types, values out of range: all told at once.
     """
+    return read_scene(scene_table(path_or_name), str(path_or_name))
+
+
+def scene_table(path_or_name: str | Path) -> dict[str, Any]:
+    """What a scene file (or a built-in scene's) holds, not looked at yet; faults as `load_scene_toml`."""
     text_name = str(path_or_name)
     if text_name in builtin_names():
         text = files("spikerig.rigctl.sim").joinpath(f"scenes/{text_name}.toml").read_text(encoding="utf-8")
@@ -241,10 +245,9 @@ def load_scene_toml(path_or_name: str | Path) -> SceneSpec:
                 cause="" if text_name.endswith(".toml") else nearest(text_name, builtin_names()),
             ) from None
     try:
-        table = tomllib.loads(text)
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise UsageError("the scene file is not valid TOML", value=f"{text_name}: {error}") from None
-    return read_scene(table, text_name)
 
 
 def read_settings(table: Mapping[str, Any], source: str) -> Settings:
@@ -257,7 +260,8 @@ def read_settings(table: Mapping[str, Any], source: str) -> Settings:
 
 def _settings(top: _Top, faults: Faults) -> Settings:
     paper = isinstance(top.exposure, Mapping) and top.exposure.get("protocol") == "paper"
-    exposure = read_record(Exposure, top.exposure, "exposure", faults, PAPER if paper else None)
+    follow = {"sub_poses": 0} if top.effects == "auto" else None  # light samples as the motion asks
+    exposure = read_record(Exposure, top.exposure, "exposure", faults, PAPER if paper else follow)
     sensor = read_record(Sensor, top.sensor, "sensor", faults, _sensor_defaults(top.sensor, paper))
     rgb = read_record(RgbCamera, top.rgb, "rgb", faults)
     cloud = read_record(Cloud, top.points, "points", faults)
@@ -272,15 +276,8 @@ def _settings(top: _Top, faults: Faults) -> Settings:
         if isinstance(top.sensor, Mapping) and name in top.sensor:
             faults.add(f"sensor.{name}", 'is for colour = "bayer"; this sensor sees gray')
     auto = tolerance if top.effects == "auto" else None
-    return Settings(top.name, top.seed, exposure, sensor, cloud, effects, rgb, auto, _event_camera(top.events, faults))
-
-
-def _event_camera(table: Any, faults: Faults) -> EventCamera | None:
-    if table is None:
-        return None
-    from spikerig.rigctl.sim.events import EventCamera
-
-    return read_record(EventCamera, table, "events", faults)
+    events = None if top.events is None else read_record(EventCamera, top.events, "events", faults)
+    return Settings(top.name, top.seed, exposure, sensor, cloud, effects, rgb, auto, events)
 
 
 def _sensor_defaults(table: Any, paper: bool) -> Mapping[str, Any]:
@@ -304,16 +301,7 @@ def _effects(top: _Top, presets: list[Mapping[str, Any]], phase: str, faults: Fa
         faults.add("effects", "list initial_phase, but exposure.phase is zero: these contradict each other")
     if phase == "random" and "initial_phase" not in found:
         found["initial_phase"] = effect_class("initial_phase")()
-    for name, effect in found.items():
-        for other in set(getattr(effect, "excludes", ())) & set(found):
-            faults.add("effects", f"list {name} and {other}: the same thing would count twice")
-        placed = getattr(effect, "placed", None)
-        if placed is not None:
-            try:
-                found[name] = placed(Path(faults.source).parent)
-            except RigError as error:
-                faults.add(f"effects.{name}", f"{error.what}: {error.value}")
-    return in_order(found.values())
+    return in_order(settled(found, Path(faults.source).parent, faults))
 
 
 def _check_exposure(exposure: Exposure, faults: Faults) -> None:

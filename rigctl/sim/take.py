@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.bayer import bayer_info
 from spikerig.dataset.clocktime import ClockModel
-from spikerig.dataset.errors import HostError
+from spikerig.dataset.errors import HostError, UsageError
 from spikerig.dataset.kernels import count
 from spikerig.dataset.scene import Camera, Frame, Points, Pose, Trajectory, Truth, View
 from spikerig.rigctl.sim.draws import stream
@@ -116,17 +116,23 @@ def take_blurry(
         rgb: linear light float32[K,H,W,3] at `plan.phases`.
         arm: the same as the RGB arm sees it, where that differs.
     """
-    exposure = rig.exposure
     view, at_ns, path = _labelled(rig, number, name, plan, track, "train")
-    first = int(plan.knots[0])
-    t0_ns = start_ns(exposure, number) + round(first * exposure.tick_ns)
-    light = Light(rgb, plan.knots - first, (-first, exposure.ticks - first), exposure.rate_hz, t0_ns, arm)
+    light = light_of(rig, number, plan, rgb, arm)
     seen = simulate(light, rig.sensor, rig.effects, rig.seed, number, rig.camera, rig.events)
     error = seen.frame.pixels * (255 / seen.frame.full) - encode(sharp)
-    counts = count(seen.spikes.bits, rig.camera.width, -first, exposure.ticks - first)
+    counts = count(seen.spikes.bits, rig.camera.width, *light.exposure)
     blur_db = 20 * np.log10(255 / max(float(np.sqrt(np.mean(error**2))), 1e-9))
     view = replace(view, frame=seen.frame, spikes=seen.spikes, trajectory=path)
     return Taken(view, sharp, at_ns, path, NO_POINTS, blur_db, float(counts.mean()), int(counts.max()), seen.events)
+
+
+def light_of(
+    rig: Rig, number: int, plan: Schedule, rgb: NDArray[np.float32], arm: NDArray[np.float32] | None = None
+) -> Light:
+    """The light of a view over its spikes, from pictures at `plan.phases`; see `take_blurry`."""
+    exposure, first = rig.exposure, int(plan.knots[0])
+    t0_ns = start_ns(exposure, number) + round(first * exposure.tick_ns)
+    return Light(rgb, plan.knots - first, (-first, exposure.ticks - first), exposure.rate_hz, t0_ns, arm)
 
 
 def _labelled(
@@ -264,8 +270,10 @@ def true_clock(rig: Rig, views: int) -> ClockModel:
         UsageError: the clock steps back from one view to the next.
     """
     clocks = [effect for effect in rig.effects if effect.stage == EffectStage.CLOCK]
-    if not clocks or not views:
+    if not clocks:
         return ClockModel.identity()
+    if views < 1:
+        raise UsageError("effects on the clock need the number of views", value=views)
     exposure, margin = rig.exposure, rig.exposure.margin_ticks
     ticks = np.unique([-margin, 0, exposure.ticks / 2, exposure.ticks, exposure.ticks + margin])
     at_ns = np.array([start_ns(exposure, k) + np.rint(ticks * exposure.tick_ns) for k in range(views)]).astype(np.int64)

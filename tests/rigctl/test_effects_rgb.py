@@ -218,6 +218,11 @@ def test_the_mosaic_sees_one_colour_a_pixel() -> None:
     assert seen[4, 5, 0] == 0.5
     assert seen[5, 5, 0] == 0.25
     assert not seen[..., 1:].any()
+    dot[4, 4], dot[4, 5] = 0, 1  # a green one keeps its own value, and its diagonals theirs
+    green = demosaic(dot, colour_masks("rggb", 8, 8))[..., 1]
+    assert green[4, 5] == 1
+    assert green[3, 4] == green[5, 6] == 0
+    assert green[4, 4] == green[3, 5] == 0.25
 
 
 def test_mosaic_of_a_single_pixel() -> None:

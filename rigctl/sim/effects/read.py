@@ -39,5 +39,5 @@ class ReadNoise:
         return Hooks(encoded=encoded)
 
     def magnitude(self, facts: Facts) -> Bound:
-        """Three standard deviations."""
-        return Bound(0.0, 3 * 255 * self.sd, f"3 x 255 x {self.sd:g}")
+        """255 sd z, z normal."""
+        return Bound(0.0, facts.counted(255 * self.sd * facts.normal()[0]), f"255 x {self.sd:g} z")
