@@ -60,16 +60,20 @@ def poses(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         (out / "poses.json").write_text(json.dumps(told, indent=1), encoding="utf-8")
-    if as_json:
-        emit("spikerig.calib.poses/1", told)
-    _tell(told)
+    refused = None
     if not told["accepted"] and not force:
-        raise RefusedError(
+        refused = RefusedError(
             "these poses are not good enough to keep",
             value="; ".join(told["reasons"]),
             cause="too little overlap or texture, too much blur, or too short a baseline",
             next="try --peak-threshold 0.0015, other --kinds, or capture more views; --force keeps them, and says so",
         )
+    _tell(told)
+    if as_json:
+        emit("spikerig.calib.poses/1", told | ({"error": refused.as_json()} if refused else {}))
+        raise typer.Exit(refused.exit_code if refused else 0)
+    if refused:
+        raise refused
 
 
 def _scene(

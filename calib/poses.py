@@ -225,6 +225,9 @@ def look_at(view: View, phase: float, kind: str) -> NDArray[np.uint8]:
     """The picture of a view by a kind of texture, at a phase of the exposure."""
     if view.spikes is None:
         raise UsageError("this view has no spikes", value=view.name)
+    if kind[:3] == "tfp" and kind[3:].isdigit() and int(kind[3:]) > view.spikes.ticks:
+        told = f"{view.name}, {kind}: {view.spikes.ticks} ticks"
+        raise UsageError("a texture does not fit the spikes", value=told, next="ask for a shorter window")
     return picture_of(texture_of(view.spikes, tick_at(view, phase), kind))
 
 

@@ -2,38 +2,11 @@
 
 import numpy as np
 import pytest
+from calib_worlds import moved, path, ring, turn
 
 from spikerig.calib.gauge import centres, degrees_apart, extent, pose_errors, similarity, umeyama
 from spikerig.calib.smooth import mean_pose, smooth_path
 from spikerig.dataset.errors import DataError
-
-
-def turn(*vector: float) -> np.ndarray:
-    import cv2
-
-    return cv2.Rodrigues(np.array(vector, np.float64))[0]
-
-
-def ring(n: int, radius: float = 2.0) -> np.ndarray:
-    """Cameras on half a circle that look at the middle."""
-    poses = []
-    for a in np.linspace(0, np.pi, n):
-        at = radius * np.array([np.cos(a), np.sin(a), 0.3])
-        z = -at / np.linalg.norm(at)
-        x = np.cross(z, [0, 0, 1])
-        x /= np.linalg.norm(x)
-        R = np.stack([x, np.cross(z, x), z])
-        poses.append(np.column_stack([R, -R @ at]))
-    return np.array(poses)
-
-
-def moved(poses: np.ndarray, scale: float, R: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """The same cameras in a world x' = scale R x + t."""
-    out = []
-    for pose in poses:
-        Q = pose[:, :3] @ R.T
-        out.append(np.column_stack([Q, scale * pose[:, 3] - Q @ t]))
-    return np.array(out)
 
 
 def test_a_similarity_is_found_exactly_and_carries_points_and_poses() -> None:
@@ -92,15 +65,6 @@ def test_mean_of_poses_lies_between() -> None:
     mean = mean_pose([a, b])
     assert np.allclose(mean[:, :3], np.eye(3))
     assert np.allclose(-mean[:, :3].T @ mean[:, 3], -(a[:, :3].T @ a[:, 3] + b[:, :3].T @ b[:, 3]) / 2)
-
-
-def path(at: np.ndarray) -> np.ndarray:
-    """A shake: turning and moving as a cubic of the phase."""
-    rows = []
-    for s in np.asarray(at):
-        R = turn(0.02 * s, -0.03 * s**2, 0.01 * s**3) @ turn(0.4, 0.2, -1.0)
-        rows.append(np.column_stack([R, [0.1 * s, 0.02 * s**2, 2.0 - 0.01 * s]]))
-    return np.array(rows)
 
 
 def test_a_smooth_path_is_kept_and_noise_is_less_after() -> None:
