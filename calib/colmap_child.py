@@ -136,8 +136,8 @@ def _map(job: dict[str, Any], root: Path, database: Path) -> list[Any]:
         return list(pycolmap.global_mapping(database, root / "images", out, options).values())
     options = pycolmap.IncrementalPipelineOptions()
     options.image_names = job["map"]
-    options.num_threads = 1  # two threads give two answers
-    options.random_seed = job["seed"]
+    options.num_threads = options.mapper.num_threads = 1  # two threads give two answers
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = job["seed"]
     options.min_model_size = 3
     options.ba_refine_focal_length = options.ba_refine_extra_params = not known
     options.ba_refine_sensor_from_rig = False
