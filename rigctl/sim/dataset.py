@@ -38,7 +38,7 @@ class Order:
     Args:
         scenes: built-in names.
         views: viewpoints a scene; None for the scene's own.
-        test_every: every how manieth view is for testing; None for the scene's own.
+        test_every: every n-th view is for testing, 0 for none; None for the scene's own.
         seed: of shake, noise and points, in place of the scenes'.
         size: width and height in pixels; the shake grows with the width. None for the scene's own.
     """

@@ -21,7 +21,7 @@ def panels(scene: Path, count: int) -> list[tuple[Pixels, Pixels, Pixels]]:
 
     Args:
         scene: a scene file with truth.
-        count: how many views at most.
+        count: how many views at most; of one, the middle one.
 
     Returns:
         uint8[H,W,3] each, sRGB; the average scaled so that RGB white is white.
@@ -29,7 +29,8 @@ def panels(scene: Path, count: int) -> list[tuple[Pixels, Pixels, Pixels]]:
     found = []
     with open_scene(scene) as file:
         names = file.train or file.names
-        for name in [names[round(k)] for k in np.linspace(0, len(names) - 1, min(count, len(names)))]:
+        spread = np.linspace(0, len(names) - 1, min(count, len(names))) if count > 1 else [len(names) // 2]
+        for name in [names[round(k)] for k in spread]:
             view = file.view(name)
             pixels = np.rint(view.frame.pixels * (255 / np.iinfo(view.frame.pixels.dtype).max)).astype(np.uint8)
             gray = np.zeros_like(pixels)

@@ -19,6 +19,7 @@ from spikerig.rigctl.sim.capture import capture, rig_of, take_view
 from spikerig.rigctl.sim.effects import Hooks
 from spikerig.rigctl.sim.events import EventCamera, simulate_events
 from spikerig.rigctl.sim.sensor import Light, spike_light
+from spikerig.rigctl.sim.shelf import dumps, loads
 from spikerig.rigctl.sim.simulate import simulate
 from spikerig.rigctl.sim.spec import Exposure, Sensor, read_scene
 from spikerig.rigctl.sim.survey import Look, survey
@@ -36,6 +37,7 @@ def test_an_event_camera_changes_nothing_else() -> None:
     assert plain.events is None
     assert beside.events is not None
     same(plain, replace(beside, events=None), "taken")
+    same(beside.events, loads(dumps(beside), "a shelf").events, "events, put on a shelf and back")
 
 
 def test_events_see_the_spikes_light() -> None:
