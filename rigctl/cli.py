@@ -40,7 +40,7 @@ def capture(
     spec = with_changes(load_scene_toml(scene), seed=seed, views=views)
     bar = Progress(f"simulating '{spec.name}'", spec.orbit.views, "views")
     told = play(spec, out, workers=cores(workers), force=force, done=bar.step)
-    _tell("spikerig.sim.capture/1", out, told, began, as_json)
+    tell("spikerig.sim.capture/1", out, told, began, as_json)
 
 
 def frames(
@@ -66,18 +66,13 @@ def frames(
     found = read_folder(folder, settings, protocol=protocol, seed=seed, bad_values=bad_values)
     bar = Progress(f"simulating '{found.rig.name}'", len(found.views), "views")
     told = capture_folder(found, out, workers=cores(workers), force=force, done=lambda taken: bar.step())
-    _tell("spikerig.sim.frames/1", out, told, began, as_json)
-    if told["bad_values"]["pictures"]:
-        bad = told["bad_values"]
-        note(
-            f"mended ({bad['how']}) in {bad['pictures']} pictures: {bad['nan']} NaN, {bad['infinite']} infinite, "
-            f"{bad['negative']} negative values"
-        )
+    tell("spikerig.sim.frames/1", out, told, began, as_json)
     if told["points"] == 0:
         note("no initial points: training will start from random ones, some 10 dB worse; give points or depth")
 
 
-def _tell(schema: str, out: Path, told: dict[str, Any], began: float, as_json: bool) -> None:
+def tell(schema: str, out: Path, told: dict[str, Any], began: float, as_json: bool) -> None:
+    """Say what a simulation made: one JSON document, and a line for people."""
     told = {"out": str(out), **told, "seconds": time.monotonic() - began}
     if as_json:
         emit(schema, told)
@@ -89,3 +84,9 @@ def _tell(schema: str, out: Path, told: dict[str, Any], began: float, as_json: b
         f"{told['size'][1]}, {told['ticks']} ticks an exposure, {told['spikes_mean']:.1f} spikes a pixel (most "
         f"{told['spikes_max']}){blur}, pose label '{told['pose_label']}', seed {told['seed']}, {told['seconds']:.1f} s"
     )
+    bad = told.get("bad_values", {"pictures": 0})
+    if bad["pictures"]:
+        note(
+            f"mended ({bad['how']}) in {bad['pictures']} pictures: {bad['nan']} NaN, {bad['infinite']} infinite, "
+            f"{bad['negative']} negative values"
+        )

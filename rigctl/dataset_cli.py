@@ -20,7 +20,8 @@ def dataset(
     scenes: Annotated[str, typer.Option(help="Built-in scenes, with commas between them; all six if not given.")] = "",
     views: Annotated[int | None, typer.Option(help="Viewpoints a scene, in place of its own (30).")] = None,
     test_every: Annotated[
-        int | None, typer.Option(help="Every how manieth view is for testing (5); the paper's half and half is 2.")
+        int | None,
+        typer.Option(help="Every N-th view is for testing, in place of 5; 2 gives the half and half of the paper."),
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Of shake, noise and points, in place of the scenes'.")] = None,
     size: Annotated[str, typer.Option(help="WIDTHxHEIGHT in pixels, in place of 400x250.")] = "",

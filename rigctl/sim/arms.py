@@ -8,7 +8,9 @@ import numpy as np
 
 from spikerig.rigctl.sim.effects import Floats, Hooks
 from spikerig.rigctl.sim.facts import SLACK, Bound, Facts
+from spikerig.rigctl.sim.rgb import window_weights
 
+NEAR = 0.8  # light that optics may raise beyond one threshold a tick
 ARMS = ("spike", "rgb", "both")
 
 
@@ -36,11 +38,24 @@ def moved(
     spikes = dn = 0.0
     for redrawn in changes:
         if arm != "rgb":
-            pairs = [(light, _after(redrawn, light[..., None])[..., 0]) for light, _ in facts.means]
+            pairs = [_rates(facts, k, redrawn) for k in range(len(facts.means))]
             spikes = max(spikes, facts.spikes_between(*np.stack(pairs, 1)))
         if arm != "spike":
             dn = max(dn, facts.dn_between(*np.stack([(rgb, _after(redrawn, rgb)) for _, rgb in facts.means], 1)))
     return spikes, dn
+
+
+def _rates(facts: Facts, k: int, redrawn: Callable[[Floats], Floats]) -> tuple[Floats, Floats]:
+    """Spikes a tick of a look before and after; instant by instant where some of it is clipped."""
+    light, look = facts.means[k][0], facts.looks[k]
+    weights = window_weights(look, np.array([float(look.exposure[0])]))[0]
+    inside = np.flatnonzero(weights)
+    seen = look.rgb[inside] @ np.array(facts.response, np.float32)
+    if seen.max(initial=0) < NEAR:
+        return light, _after(redrawn, light[..., None])[..., 0]
+    after = redrawn(seen[..., None])[..., 0]
+    before, after = (np.tensordot(weights[inside], np.clip(a, 0, 1), 1) for a in (seen, after))
+    return before, after
 
 
 def _after(change: Callable[[Floats], Floats], mean: Floats) -> Floats:

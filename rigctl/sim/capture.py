@@ -16,7 +16,7 @@ from spikerig.rigctl.sim.light import Stage, stage_of
 from spikerig.rigctl.sim.plan import Plan, plan, resolve
 from spikerig.rigctl.sim.schedule import Track, schedule, track_phases
 from spikerig.rigctl.sim.spec import SceneSpec
-from spikerig.rigctl.sim.take import Rig, Taken, pack, share_of, surface, take_blurry, take_sharp
+from spikerig.rigctl.sim.take import Rig, Taken, pack, share_of, surface, take_blurry, take_sharp, true_clock
 from spikerig.rigctl.sim.viewpoint import camera_of, timed, view_path
 
 
@@ -93,6 +93,7 @@ def capture(
     path = Path(path)
     refuse_existing(path, force)
     spec, judged = settled(spec)
+    true_clock(rig_of(spec), spec.orbit.views)  # one that steps back is refused before any work
     info = provenance(spec, judged)
     made = {"name": spec.name, "seed": spec.seed, **info, "made_with": fingerprint()}
     folder, views = path.with_name(path.name + ".views"), spec.orbit.views

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -12,8 +13,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from spikerig.dataset import machine
 from spikerig.dataset.errors import DataError, HostError, UsageError
 from spikerig.dataset.terminal import jsonable
@@ -21,13 +20,14 @@ from spikerig.rigctl.sim.capture import provenance, rig_of, settled
 from spikerig.rigctl.sim.farm import Cluster, fill, finished
 from spikerig.rigctl.sim.limits import nearest
 from spikerig.rigctl.sim.plan import Plan
+from spikerig.rigctl.sim.sheet import contact_sheet, overview
 from spikerig.rigctl.sim.shelf import Shelf, alone, differences, fingerprint, write_whole
 from spikerig.rigctl.sim.spec import SceneSpec, builtin_names, load_scene_toml, with_changes
 from spikerig.rigctl.sim.take import pack
 
 SCHEMA = "spikerig.sim.dataset/1"
 SIX = ("leaves", "parts", "glossy", "mesh", "fabric", "round")
-MANIFEST = "manifest.json"
+MANIFEST, OVERVIEW = "manifest.json", "overview.png"
 SPARE_BYTES = 1 << 28  # of disk that is left free
 
 
@@ -38,7 +38,7 @@ class Order:
     Args:
         scenes: built-in names.
         views: viewpoints a scene; None for the scene's own.
-        test_every: every how manieth view is for testing; None for the scene's own.
+        test_every: every n-th view is for testing, 0 for none; None for the scene's own.
         seed: of shake, noise and points, in place of the scenes'.
         size: width and height in pixels; the shake grows with the width. None for the scene's own.
     """
@@ -118,7 +118,7 @@ def make(
         for name, spec in specs.items():
             if name in kept:
                 continue
-            started = time.monotonic()
+            started = time.monotonic(), _cpu_seconds()
             spec, judged = settled(spec)
             shelf = Shelf(folder / f"{name}.views", made, force)
             lacking = len(shelf.missing(spec.orbit.views))
@@ -132,13 +132,15 @@ def make(
                 {
                     "scene": name,
                     "views": lacking,
-                    "seconds": time.monotonic() - started,
+                    "seconds": time.monotonic() - started[0],
+                    "cpu_seconds": None if cluster else _cpu_seconds() - started[1],
                     "workers": len(cluster.workers) if cluster else workers,
                     "cluster": scheduler or None,
                 }
             )
             _write(folder, document)
             shelf.clear()
+        overview(folder / OVERVIEW, [folder / row["file"] for row in document["scenes"].values()])
         document["status"] = "complete"
         _write(folder, document)
     return document | {"kept": kept}
@@ -223,6 +225,12 @@ def canonical(order: Mapping[str, Any]) -> str:
     return " ".join(words)
 
 
+def _cpu_seconds() -> float:
+    """CPU time of this process and of those that it started and that ended."""
+    spent = os.times()
+    return spent.user + spent.system + spent.children_user + spent.children_system
+
+
 def _changed(folder: Path, row: Mapping[str, Any]) -> bool:
     path = folder / Path(str(row["file"])).name
     return not path.is_file() or path.stat().st_size != row["bytes"] or sha256_of(path) != row["sha256"]
@@ -277,24 +285,3 @@ def _seal(folder: Path, spec: SceneSpec, shelf: Shelf, judged: Plan | None) -> d
         "sheet": sheet.name,
         **{key: told[key] for key in keys},
     }
-
-
-def contact_sheet(out: Path, scene: Path, columns: int = 4) -> None:
-    """A PNG of a scene: blurry pictures of some views for training, their spikes' averages, the sharp truth."""
-    from spikerig.dataset.images import srgb8_from_linear, write_image
-    from spikerig.dataset.store import open_scene
-    from spikerig.dataset.texture import tfp
-
-    rows: list[list[np.ndarray]] = []
-    with open_scene(scene) as file:
-        names = file.train or file.names
-        for name in [names[round(k)] for k in np.linspace(0, len(names) - 1, min(columns, len(names)))]:
-            view, light = file.view(name), file.truth_light(name)
-            full = np.iinfo(view.frame.pixels.dtype).max
-            pixels = np.rint(view.frame.pixels * (255 / full)).astype(np.uint8)
-            gray = np.zeros_like(pixels)
-            if view.spikes is not None:
-                texture = tfp(view.spikes, view.spikes.ticks // 2, min(64, view.spikes.ticks)).light
-                gray = np.repeat(srgb8_from_linear(texture / (file.light_gain or 1))[..., None], 3, 2)
-            rows.append([pixels, gray, srgb8_from_linear(light)])
-    write_image(out, np.concatenate([np.concatenate(list(row), 1) for row in zip(*rows, strict=True)], 0), force=True)

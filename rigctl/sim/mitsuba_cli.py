@@ -41,7 +41,7 @@ def mitsuba(
     Mitsuba runs in a process of its own. The rendered pictures are a folder as `sim frames` reads it.
     """
     from spikerig.dataset.outfile import refuse_existing
-    from spikerig.rigctl.cli import _tell, _workers
+    from spikerig.rigctl.cli import cores, tell
     from spikerig.rigctl.sim.folder import read_folder
     from spikerig.rigctl.sim.frames import capture_folder
     from spikerig.rigctl.sim.mitsuba_scene import plan_scene, render_folder
@@ -54,7 +54,7 @@ def mitsuba(
     refuse_existing(out, force)
     if not out.parent.is_dir():
         raise UsageError("there is no such folder", value=out.parent, next=f"mkdir -p {out.parent}")
-    plan, count = plan_scene(scene, settings, seed=seed, spp=spp, variant=variant), _workers(workers)
+    plan, count = plan_scene(scene, settings, seed=seed, spp=spp, variant=variant), cores(workers)
     with ExitStack() as stack:
         folder = frames
         if folder is None:
@@ -69,4 +69,4 @@ def mitsuba(
         told = capture_folder(found, out, workers=count, force=force, done=lambda taken: bar.step())
     render = {"spp": plan.renderer.spp, "variant": plan.renderer.variant, "pictures": len(plan.shots)}
     told |= {"mitsuba": render, "frames": None if frames is None else str(frames)}
-    _tell("spikerig.sim.mitsuba/1", out, told, began, as_json)
+    tell("spikerig.sim.mitsuba/1", out, told, began, as_json)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -12,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.errors import UsageError
-from spikerig.dataset.kernels import fire
 from spikerig.rigctl.sim.draws import stream
 from spikerig.rigctl.sim.moving import Moving
 from spikerig.rigctl.sim.sensor import spike_light
 from spikerig.rigctl.sim.spec import Sensor
+from spikerig.rigctl.sim.stream import opened, spike_blocks
 
 Floats = NDArray[np.floating]
 BLOCK = 2048  # ticks made at once: 26 MB of a Vidar
@@ -169,37 +168,20 @@ def spikes_of(
     start = np.zeros((moving.height, moving.width))
     if retake.phase == "random":
         start = stream(retake.seed, "initial_phase", 0).random(start.shape)
-    state = {"ticks": 0, "spikes": 0, "clipped": 0.0}
-    charge = (start * 2.0**32).astype(np.uint32)
-    last: tuple[int, Floats] | None = None
-    for tick, picture in knots(moving, retake):
-        if exposures is not None:
-            exposures.add(tick, picture)
-        light = spike_light(picture[None], sensor)[0]
-        if last is not None:
-            for stretch, ends in _stretches(*last, tick, light, retake.hold):
-                bits, charge, lost = fire(stretch, ends, charge, hold=False)
-                state["ticks"] += len(bits)
-                state["spikes"] += int(np.bitwise_count(bits).sum())
-                state["clipped"] += float(lost.sum())
-                sink(bits)
-        last = (tick, light)
-    pixels = moving.width * moving.height * max(int(state["ticks"]), 1)
-    fired = state["spikes"]
+
+    def lights() -> Iterator[tuple[int, Floats]]:
+        for tick, picture in knots(moving, retake):
+            if exposures is not None:
+                exposures.add(tick, picture)
+            yield tick, spike_light(picture[None], sensor)[0]
+
+    account, fired = opened(start), 0
+    for bits in spike_blocks(lights(), account, hold=retake.hold, block_ticks=BLOCK):
+        fired += int(np.bitwise_count(bits).sum())
+        sink(bits)
+    clipped = float(account.lost.sum())
     return {
-        "ticks": int(state["ticks"]),
-        "spikes_per_tick": fired / pixels,
-        "clipped_share": state["clipped"] / max(fired + state["clipped"], 1e-300),
+        "ticks": account.ticks,
+        "spikes_per_tick": fired / (start.size * max(account.ticks, 1)),
+        "clipped_share": clipped / max(fired + clipped, 1e-300),
     }
-
-
-def _stretches(
-    a: int, before: Floats, b: int, after: Floats, hold: bool
-) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int64]]]:
-    """Light [2,H,W] and its two knots over [a, b), cut where a block ends; cuts depend on ticks alone."""
-    cuts = [a, *range((a // BLOCK + 1) * BLOCK, b, BLOCK), b]
-    for first, stop in itertools.pairwise(cuts):
-        ends = [before if hold else before + (after - before) * np.float32((t - a) / (b - a)) for t in (first, stop)]
-        if stop == b and not hold:
-            ends[1] = after
-        yield np.stack(ends).astype(np.float32, copy=False), np.array([first, stop])

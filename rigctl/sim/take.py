@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.bayer import bayer_info
 from spikerig.dataset.clocktime import ClockModel
-from spikerig.dataset.errors import HostError
+from spikerig.dataset.errors import HostError, UsageError
 from spikerig.dataset.kernels import count
 from spikerig.dataset.scene import Camera, Frame, Points, Pose, Trajectory, Truth, View
 from spikerig.rigctl.sim.draws import stream
@@ -270,8 +270,10 @@ def true_clock(rig: Rig, views: int) -> ClockModel:
         UsageError: the clock steps back from one view to the next.
     """
     clocks = [effect for effect in rig.effects if effect.stage == EffectStage.CLOCK]
-    if not clocks or not views:
+    if not clocks:
         return ClockModel.identity()
+    if views < 1:
+        raise UsageError("effects on the clock need the number of views", value=views)
     exposure, margin = rig.exposure, rig.exposure.margin_ticks
     ticks = np.unique([-margin, 0, exposure.ticks / 2, exposure.ticks, exposure.ticks + margin])
     at_ns = np.array([start_ns(exposure, k) + np.rint(ticks * exposure.tick_ns) for k in range(views)]).astype(np.int64)

@@ -44,7 +44,7 @@ def sums(folder: Path) -> tuple[str, str]:
 
 
 def test_what_is_made(whole: Path) -> None:
-    assert sorted(p.name for p in whole.iterdir()) == ["glossy.h5", "glossy.png", "manifest.json"]
+    assert sorted(p.name for p in whole.iterdir()) == ["glossy.h5", "glossy.png", "manifest.json", "overview.png"]
     manifest = dataset.read_manifest(whole)
     row = manifest["scenes"]["glossy"]
     assert manifest["status"] == "complete"
@@ -63,6 +63,10 @@ def test_what_is_made(whole: Path) -> None:
     assert sheet.shape == (60, 64, 3)
     assert np.array_equal(sheet[:20, :32], scene.views[0].frame.pixels)
     assert sheet[20:40].std() > 10
+    small_one = read_image(whole / "overview.png")
+    assert small_one.shape == (10, 96, 3)
+    assert abs(float(small_one[:, :16].mean()) - float(sheet[:20, 32:].mean())) < 0.5
+    assert not small_one[:, 48:].any()
 
 
 def test_half_and_half_as_in_the_paper() -> None:
@@ -117,7 +121,7 @@ def test_a_killed_run_goes_on(whole: Path, tmp_path: Path, monkeypatch: pytest.M
     assert made == [k for k in range(4) if f"{k:06d}.npz" not in there]
     assert told["kept"] == []
     assert sums(out) == sums(whole)
-    assert sorted(p.name for p in out.iterdir()) == ["glossy.h5", "glossy.png", "manifest.json"]
+    assert sorted(p.name for p in out.iterdir()) == ["glossy.h5", "glossy.png", "manifest.json", "overview.png"]
     made.clear()
     assert make(out, ORDER)["kept"] == ["glossy"]
     assert made == []

@@ -110,6 +110,10 @@ def test_a_random_walk_is_one_path() -> None:
     assert paths.var(axis=0) == pytest.approx(times, rel=tight)
     assert np.diff(paths).var(axis=0) == pytest.approx(np.diff(times), rel=tight)
     assert abs(np.corrcoef(paths[:, 0], paths[:, 1] - paths[:, 0])[0, 1]) < 0.25
+    bends = np.array(
+        [[walk(s, t) + walk(s, t + 1) - 2 * walk(s, t + 0.5) for t in (4.0, 5.0, 6.0)] for s in range(100)]
+    )
+    assert np.abs(np.corrcoef(bends.T) - np.eye(3)).max() < 0.5
     assert walk(1, 0.0) == 0
     assert ahead_us(ClockWander(2.0), 4.0, view=0) == ahead_us(ClockWander(2.0), 4.0, view=9) == 2 * walk(3, 4.0)
     assert abs(walk(1, 1.0) - walk(1, 1.0 + 1e-6)) < 0.02

@@ -210,6 +210,21 @@ def test_a_shifted_arm_sees_parallax(z: float, b: float) -> None:
     assert moved == pytest.approx(camera.K[0, 0] * b / z, abs=0.08)
 
 
+def test_which_way_an_arm_turns() -> None:
+    """A point on the spike camera's axis lies to the right of the RGB camera's after a turn about y (down); below for
+    a turn back about x; one on the right goes down for a turn about z. First x, then y, then z."""
+    ahead, right = np.array([0, 0, 1.0]), np.array([1.0, 0, 0])
+
+    def turned(x: float, y: float, z: float, point: np.ndarray) -> np.ndarray:
+        return Misalignment((x, y, z)).rgb_from_spike[:, :3] @ point
+
+    s, c = np.sin(np.radians(10)), np.cos(np.radians(10))
+    assert np.allclose(turned(0, 10, 0, ahead), (s, 0, c))
+    assert np.allclose(turned(-10, 0, 0, ahead), (0, s, c))
+    assert np.allclose(turned(0, 0, 10, right), (c, s, 0))
+    assert np.allclose(turned(90, 90, 0, ahead), turned(0, 90, 0, turned(90, 0, 0, ahead)))
+
+
 def test_a_turned_arm_is_a_homography() -> None:
     """What is cast from the turned pose and what is redrawn from the other agree where both see."""
     spec = small(camera__width=120, camera__height=90)

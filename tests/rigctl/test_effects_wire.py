@@ -77,7 +77,7 @@ def test_flips_have_their_chance_and_spare_the_padding(chance: float) -> None:
 
 
 def test_flips_are_everywhere_and_their_own_in_each_view() -> None:
-    light = steady(0.0, 2000, 12, 16)
+    light = steady(0.0, 12_000, 12, 16)  # drawn for in parts
     first, second = (run(light, BitFlips(0.01), view=v) for v in (0, 1))
     ones = np.unpackbits(first.bits, axis=2, bitorder="little")
     for axes in ((1, 2), (0, 2), (0, 1)):

@@ -37,7 +37,7 @@ fov_deg = 50
 views = 3
 radius = 2.5
 height = 1.1
-target = [0.2, 0.1, 0.3]
+target = [0.0, 0.25, 0.2]
 test = [2]
 [shake]
 path_px = [3, 5]
@@ -145,10 +145,12 @@ def test_a_run_cut_short_goes_on(made: Path, tmp_path: Path, capfd: pytest.Captu
 def test_the_axis_that_points_up(tmp_path: Path) -> None:
     """The ball of a scene whose y (or x) points up, seen as ours is: the same depth, picture by picture."""
     depths = {}
-    for up, (x, y, z) in {"z": (0.2, 0.1, 0.3), "y": (0.2, 0.3, -0.1), "x": (0.3, 0.2, 0.1)}.items():
+    turns = {"z": lambda x, y, z: (x, y, z), "y": lambda x, y, z: (x, z, -y), "x": lambda x, y, z: (z, x, y)}
+    for up, turn in turns.items():
         root = tmp_path / up
         root.mkdir()
-        text = SETTINGS.replace("[mitsuba]", f'[mitsuba]\nup = "{up}"').replace("[0.2, 0.1, 0.3]", f"[{x}, {y}, {z}]")
+        target, (x, y, z) = turn(0.0, 0.25, 0.2), turn(0.2, 0.1, 0.3)
+        text = SETTINGS.replace("[mitsuba]", f'[mitsuba]\nup = "{up}"').replace("[0.0, 0.25, 0.2]", str(list(target)))
         plan = plan_scene(ball(root, text, BALL.replace('x="0.2" y="0.1" z="0.3"', f'x="{x}" y="{y}" z="{z}"')))
         plan.shots[:] = [shot for shot in plan.shots if shot["kind"] == "depth"]
         render_folder(plan, root / "f")
@@ -202,6 +204,7 @@ def test_the_documented_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         ("mitsuba = 3\n", "expected a table"),
         ('[mitsuba]\nup = "w"\n', "expected one of x, y, z"),
         ('[exposure]\nlight = "hold"\n', "margin_ticks: are not for light that holds"),
+        ("[exposure]\nsub_poses = 0\n", "say how many"),
         ("[orbit]\nradus = 3\n", "did you mean 'radius'"),
         ("[orbit\n", "cannot be read"),
     ],
@@ -249,6 +252,17 @@ def test_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capf
     assert run(["sim", "mitsuba", str(ball(tmp_path)), "-o", str(tmp_path / "o.h5")]) == 6
     assert 'pip install "spikerig[mitsuba]"' in capfd.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["ball.toml", "ball.xml"]
+
+
+def test_effects_chosen_by_the_scene(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """`auto` is settled by the rendered frames; a noise far below the tolerance is left out, one far above is not."""
+    chosen = 'effects = "auto"\nconsider = [{ name = "read_noise", sd = 1e-6 }, { name = "dark_current", rate = 0.5 }]'
+    text = SETTINGS.replace('effects = ["shot_noise", { name = "dark_current", rate = 0.01 }]', chosen)
+    words = ["sim", "mitsuba", str(ball(tmp_path, text)), "-o", str(tmp_path / "o.h5"), "--workers", "1", "--json"]
+    assert run(words) == 0
+    told = json.loads(capfd.readouterr().out)
+    assert "dark_current" in told["effects"]
+    assert "read_noise" not in told["effects"]
 
 
 def test_settings_survive_as_toml() -> None:

@@ -23,6 +23,8 @@ from spikerig.rigctl.sim import retake as module
 from spikerig.rigctl.sim.moving import Look, Moving, open_moving
 from spikerig.rigctl.sim.retake import Exposures, Retake, knots, spikes_of
 from spikerig.rigctl.sim.rgb import encode
+from spikerig.rigctl.sim.sensor import spike_light
+from spikerig.rigctl.sim.spec import Sensor
 
 RNG = np.random.default_rng(0)
 WEIGHTS = np.array([0.299, 0.587, 0.114])
@@ -42,22 +44,21 @@ def made(source: Moving, retake: Retake, exposures: Exposures | None = None) -> 
 
 @pytest.mark.parametrize("hold", [False, True])
 def test_spikes_are_those_of_the_oracle(hold: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever the size of a block of ticks: cuts change no more than the rounding of light at the cut."""
+    """Bit for bit, whatever the length of a block."""
     pictures = RNG.random((4, 5, 11, 3), np.float32)
     retake = Retake(rate_hz=10_000, gain=0.7, hold=hold, phase="zero")
     times = [0.0, 0.013, 0.02, 0.05]
     bits, told = made(moving(pictures, times), retake)
     ticks = [0, 130, 200, 500] + ([600] if hold else [])
-    light = (pictures @ WEIGHTS.astype(np.float32)) * np.float32(0.7)
+    light = spike_light(pictures.copy(), Sensor(gain=0.7))
+    np.testing.assert_allclose(light, 0.7 * pictures @ WEIGHTS, rtol=1e-5)
     expected = oracles.fire(light, np.array(ticks), np.zeros((5, 11), np.uint32), hold=hold)[0]
     assert told["ticks"] == ticks[-1] == len(bits)
-    counts, wanted = (unpack(b, 11).sum(0, dtype=int) for b in (bits, expected))
-    assert np.abs(counts - wanted).max() <= 1
-    assert (unpack(bits, 11) != unpack(expected, 11)).mean() < 1e-3
-    assert told["spikes_per_tick"] == pytest.approx(counts.mean() / ticks[-1])
+    assert np.array_equal(bits, expected)
+    assert told["spikes_per_tick"] == pytest.approx(unpack(bits, 11).mean())
     monkeypatch.setattr(module, "BLOCK", 64)
     again, _ = made(moving(pictures, times), retake)
-    assert np.abs(unpack(again, 11).sum(0, dtype=int) - wanted).max() <= 1
+    assert np.array_equal(again, expected)
 
 
 def test_the_phase_is_seeded() -> None:
@@ -267,7 +268,12 @@ def test_an_interrupt_leaves_nothing_half(tmp_path: Path) -> None:
         [sys.executable, "-c", code, *words, "--frames-out", str(tmp_path / "rgb")], stderr=subprocess.PIPE
     )
     deadline = time.monotonic() + 60
-    while not list(tmp_path.glob(".o.*")) and time.monotonic() < deadline and child.poll() is None:
+    # not at its first breath: Cython's modules (numpy.random) swallow an interrupt while they are imported
+    while (
+        not any(p.stat().st_size for p in tmp_path.glob(".o.*"))
+        and time.monotonic() < deadline
+        and child.poll() is None
+    ):
         time.sleep(0.02)
     child.send_signal(signal.SIGINT)
     _, err = child.communicate(timeout=60)

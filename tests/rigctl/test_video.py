@@ -5,6 +5,7 @@ from collections.abc import Callable
 from contextlib import closing
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import av
@@ -271,6 +272,19 @@ def test_truncated_and_corrupt_videos(tmp_path: Path) -> None:
         except DataError:
             pass
         video.close()
+
+
+def test_a_stream_that_ends_before_its_promise(tmp_path: Path) -> None:
+    """The decoder may end without a word: the number of frames that the file promised tells."""
+    with closing(open_video(write(tmp_path / "v.mkv", [gray(9)] * 10))) as video:
+        video.stream = SimpleNamespace(frames=40, codec_context=video.stream.codec_context)
+        container = video.container
+        video.container = SimpleNamespace(decode=lambda _: container.decode(video=0), close=container.close)
+        with pytest.raises(DataError, match="breaks off") as told:
+            list(video.frames())
+    assert "after 10 frames, 0.360 s" in str(told.value)
+    assert "40 frames were promised" in told.value.cause
+    assert "--limit 0.2" in told.value.next
 
 
 def test_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,11 +12,13 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spikerig.dataset.errors import RigError
 from spikerig.rigctl.sim.draws import stream
 from spikerig.rigctl.sim.limits import Faults, nearest, read_record
 
@@ -221,6 +223,20 @@ def read_effects(rows: Any, faults: Faults, where: str = "effects") -> dict[str,
             rest = {key: value for key, value in table.items() if key != "name"}
             found[name] = read_record(effect_class(name), rest, f"{where}[{k}]", faults)
     return found
+
+
+def settled(found: Mapping[str, Effect], folder: Path, faults: Faults) -> list[Effect]:
+    """Effects with their files found from a folder; faults where a file cannot be used or two count the same twice."""
+    out: list[Effect] = []
+    for name, effect in found.items():
+        for other in set(getattr(effect, "excludes", ())) & set(found):
+            faults.add("effects", f"list {name} and {other}: the same thing would count twice")
+        placed = getattr(effect, "placed", None)
+        try:
+            out.append(effect if placed is None else placed(folder))
+        except RigError as error:
+            faults.add(f"effects.{name}", f"{error.what}: {error.value}")
+    return out
 
 
 def in_order(effects: Iterable[Effect]) -> tuple[Effect, ...]:

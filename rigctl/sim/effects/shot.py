@@ -40,9 +40,7 @@ class ShotNoise:
         return Hooks(pixel={"shot": (self.threshold_e, site.key(self.name))})
 
     def magnitude(self, facts: Facts) -> Bound:
-        """Charge of standard deviation sqrt(light ticks / threshold_e), in the exposure and in the margin before; less
-        what noise adds beyond one spike a tick and the sensor clips.
-        """
+        """Charge of sd sqrt(light ticks / threshold_e), in exposure and margin, less what the sensor clips."""
         mean, sd = np.zeros_like(facts.light), np.sqrt(facts.light / self.threshold_e)
         bright = np.flatnonzero(facts.light + 4 * sd > 1)
         z = np.array([NormalDist().inv_cdf((k + 0.5) / 64) for k in range(64)])[:, None]

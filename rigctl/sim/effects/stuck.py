@@ -47,6 +47,9 @@ class StuckPixels:
 
     def magnitude(self, facts: Facts) -> Bound:
         """A share of the pixels loses its count, a share gains the ticks without a spike."""
-        lost, gained = facts.spikes(-facts.rate, self.dead), facts.spikes(1 - facts.rate, self.lit)
+        share = self.dead + self.lit * (1 - self.dead)
+        size = facts.normal().shape[1:]
+        dead = np.random.default_rng(95).random(size) * share < self.dead
+        spikes = facts.counted(np.where(dead, -facts.rate, 1 - facts.rate) * facts.ticks, share=share)
         told = f"{100 * self.dead:g} % lose {facts.most(facts.counts):.3g}, {100 * self.lit:g} % gain the rest"
-        return Bound(lost + gained, 0.0, told)
+        return Bound(spikes, 0.0, told)
