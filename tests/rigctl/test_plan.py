@@ -215,6 +215,8 @@ def test_motion_of_known_moves() -> None:
     moved = motion_px(camera, depth, base, np.stack(moves))
     assert moved[-1] == pytest.approx(f * 0.2 / 2)
     assert moved[0].max() < 0.01  # what is far does not move
+    behind = [np.concatenate([np.eye(3), [[0], [0], [z]]], 1) for z in (0.0, -2.0, -4.0, 0.0)]
+    assert np.all(np.isfinite(motion_px(camera, depth, base, np.stack(behind))))
     turns = [np.concatenate([rotation(np.array([[0, 0, a]]))[0], np.zeros((3, 1))], 1) for a in np.linspace(0, 0.1, 9)]
     around = motion_px(camera, depth, base, np.stack(turns))
     y, x = np.mgrid[0:120:4, 0:200:4] + 0.5
