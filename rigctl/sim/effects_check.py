@@ -139,7 +139,7 @@ def samples(spec: SceneSpec, made: Plan) -> dict[str, Any]:
     if n == 1:
         return about | {"spikes_off": 0.0, "dn_off": 0.0}
 
-    def mean(cuts: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def mean(cuts: int) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         phases = (np.arange(cuts) + 0.5) / cuts if hold else np.linspace(0, 1, cuts + 1)
         weights = np.ones(len(phases))
         if not hold:
