@@ -107,9 +107,9 @@ def _samples(scenes: list[dict[str, Any]]) -> str:
         )
     return "\n".join(lines) + (
         "\n\nThe longest motion of a pixel in the views looked at, its step between light samples (the paper's "
-        "protocol has 18 whatever the motion; a sample a tick is the most), the first view's samples; then what they leave in "
-        "95 % of the pixels: the plan's bound, and one view against four times as many. Spikes: the light of an "
-        "exposure in thresholds, at most one a tick; DN before rounding.\n"
+        "protocol has 18 whatever the motion; a sample a tick is the most), the first view's samples; then what they "
+        "leave in 95 % of the pixels: the plan's bound, and one view against four times as many. Spikes: the light of "
+        "an exposure in thresholds, at most one a tick; DN before rounding.\n"
     )
 
 
