@@ -1,0 +1,79 @@
+"""Exact pictures of a checkerboard, by casting rays through a known lens; and what a spike sensor makes of them."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from spikerig.calib.bundle import turn
+from spikerig.calib.lens import directions, project
+from spikerig.dataset.kernels import fire
+from spikerig.dataset.scene import Camera
+from spikerig.dataset.spikes import SpikeStream
+
+COLS, ROWS, SQUARE = 9, 6, 24.0
+
+
+def corners(cols: int = COLS, rows: int = ROWS, square: float = SQUARE) -> np.ndarray:
+    """float64[N,3], row by row, about the middle."""
+    xy = np.stack(np.meshgrid(np.arange(cols), np.arange(rows)), -1).reshape(-1, 2) * square
+    return np.concatenate([xy - xy.mean(0), np.zeros((len(xy), 1))], 1)
+
+
+@dataclass
+class Lens:
+    """A camera that casts `samples` x `samples` rays a pixel; its directions are found once."""
+
+    camera: Camera
+    samples: int = 4
+    rays: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        s, cam = self.samples, self.camera
+        x, y = ((np.arange(n * s) + 0.5) / s for n in (cam.width, cam.height))
+        self.rays = directions(cam, np.stack(np.meshgrid(x, y), -1))[..., :2].astype(np.float32)
+
+    def picture(self, pose: np.ndarray, black: float = 0.05, white: float = 0.8, behind: float = 0.3,
+                cols: int = COLS, rows: int = ROWS, square: float = SQUARE) -> np.ndarray:  # fmt: skip
+        """Linear light float32[H,W] of a board with a white rim at cam_from_board."""
+        H = np.linalg.inv(np.stack([pose[:, 0], pose[:, 1], pose[:, 3]], 1))  # plane point from direction
+        x, y = self.rays[..., 0], self.rays[..., 1]
+        u, v, w = (np.float32(r[0]) * x + np.float32(r[1]) * y + np.float32(r[2]) for r in H)
+        i, j = (u / w / square + (cols + 1) / 2), (v / w / square + (rows + 1) / 2)
+        dark = (np.floor(i).astype(np.int32) + np.floor(j).astype(np.int32)) & 1
+        light = np.where(dark == 1, np.float32(black), np.float32(white))
+        light[(i < 0) | (i > cols + 1) | (j < 0) | (j > rows + 1)] = white
+        light[(i < -1) | (i > cols + 2) | (j < -1) | (j > rows + 2) | (w <= 0)] = behind
+        s = self.samples
+        return light.reshape(self.camera.height, s, self.camera.width, s).mean((1, 3))
+
+    def corners(self, pose: np.ndarray, **board: float) -> np.ndarray:
+        """Where the corners truly are, float64[N,2]."""
+        return project(self.camera, corners(**board) @ pose[:, :3].T + pose[:, 3])
+
+
+def poses(count: int, seed: int = 0, tilt_deg: float = 35, near: float = 330, far: float = 620) -> np.ndarray:
+    """spike_from_board float64[V,3,4]: tilted about random axes, near the axis, over a range of distances."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for k in range(count):
+        about = 2 * np.pi * (k / count + 0.05 * rng.standard_normal())
+        w = np.radians(tilt_deg) * rng.uniform(0.5, 1) * np.array([np.cos(about), np.sin(about), 0])
+        z = rng.uniform(near, far)
+        t = np.array([rng.uniform(-0.13, 0.13) * z, rng.uniform(-0.07, 0.07) * z, z])
+        R = turn(np.array([0, 0, rng.uniform(-0.25, 0.25)])) @ turn(w)
+        found.append(np.concatenate([R, t[:, None]], 1))
+    return np.stack(found)
+
+
+def spikes(light: np.ndarray, ticks: int, seed: int, *, noisy: bool = True, fpn: float = 0.04) -> SpikeStream:
+    """Integrate and fire, random phase; noisy: threshold FPN (the same for a sensor) and shot noise of 560 e-."""
+    rng = np.random.default_rng([seed, 7])
+    held = light[None].astype(np.float32)
+    phase = rng.integers(0, 2**32, light.shape, dtype=np.uint32)
+    if noisy:
+        held = held / (1 + fpn * np.random.default_rng(99).standard_normal(light.shape)).astype(np.float32)
+        electrons = rng.poisson(np.repeat(held, ticks, 0) * 560).astype(np.float32) / 560
+        bits, _, _ = fire(electrons, np.arange(ticks + 1), phase, hold=True)
+    else:
+        bits, _, _ = fire(held, np.array([0, ticks]), phase, hold=True)
+    return SpikeStream(bits, light.shape[1], 40_000.0)
