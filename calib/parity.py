@@ -76,12 +76,12 @@ def _match(board: Board, first: Mono, second: Mono, flip: bool) -> Match:
     second = _relabelled(board, second, labels)
     sights = (first.sight, second.sight)
     lenses = (first.fit.lenses[0], second.fit.lenses[0])
-    off = _transfer(second, _times(step, first.fit.poses), points)
+    off = _transfer(second, times(step, first.fit.poses), points)
     agree = pairs & (off <= max(CAP * diagonal, 3 * float(np.min(off[pairs], initial=np.inf))))
     poses = first.fit.poses
     for _ in range(3):
         # a board's pose is started from the arm that explains the pair better
-        other = _times(_inverse(step), second.fit.poses)
+        other = times(inverse(step), second.fit.poses)
         poses = np.where((_pair_cost(points, sights, lenses, other, step)
                           < _pair_cost(points, sights, lenses, poses, step))[:, None, None], other, poses)  # fmt: skip
         guess = Guess(lenses, poses, step)
@@ -110,8 +110,8 @@ def _consensus(
     best, chosen, labels = np.inf, second.fit.poses[0], np.zeros(len(pairs), int)
     for v in np.flatnonzero(pairs):
         for k in range(len(board.turns)):
-            step = _times(poses[k][v], _inverse(first.fit.poses[v]))
-            seen = _times(step, first.fit.poses)
+            step = times(poses[k][v], inverse(first.fit.poses[v]))
+            seen = times(step, first.fit.poses)
             off = np.stack([
                 _transfer(_relabelled(board, second, np.full(len(pairs), t)), seen, points) for t in board.turns
             ])  # fmt: skip
@@ -146,13 +146,14 @@ def _homogeneous(R: Floats) -> Floats:
     return out
 
 
-def _times(a: Floats, b: Floats) -> Floats:
-    """a after b, both [...,3,4]."""
+def times(a: Floats, b: Floats) -> Floats:
+    """Rigid maps float64[...,3,4]: b, then a."""
     R = a[..., :3] @ b[..., :3]
     return np.concatenate([R, (a[..., :3] @ b[..., 3:]) + a[..., 3:]], -1)
 
 
-def _inverse(a: Floats) -> Floats:
+def inverse(a: Floats) -> Floats:
+    """Rigid maps float64[...,3,4] the other way."""
     R = np.swapaxes(a[..., :3], -1, -2)
     return np.concatenate([R, -R @ a[..., 3:]], -1)
 
@@ -177,7 +178,7 @@ def _pair_cost(
 ) -> Floats:
     """Mean square distance over both arms' corners, float64[V]."""
     total, n = np.zeros(len(poses)), np.zeros(len(poses))
-    for sight, lens, at in zip(sights, lenses, (poses, _times(step, poses)), strict=True):
+    for sight, lens, at in zip(sights, lenses, (poses, times(step, poses)), strict=True):
         off = np.where(sight.seen[..., None], sight.px - _predicted(lens, at, points), 0)
         total, n = total + (off**2).sum((1, 2)), n + sight.seen.sum(1)
     return total / np.maximum(n, 1)
