@@ -303,9 +303,7 @@ def _step(A: Floats, B: Floats, C: Floats, a: Floats, c: Floats, damping: float)
     return shared, inner[:, :, -1] - inner[:, :, :-1] @ shared
 
 
-def _told(
-    problem: _Problem, state: Guess, A: Floats, B: Floats, C: Floats, cost: float, converged: bool
-) -> Fit:
+def _told(problem: _Problem, state: Guess, A: Floats, B: Floats, C: Floats, cost: float, converged: bool) -> Fit:
     off, _ = problem.residuals(state)
     used = tuple(s.seen & problem.use[:, None] for s in problem.sights)
     names = problem.names(state.lenses)

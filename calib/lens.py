@@ -119,7 +119,9 @@ def reach(coefficients: Floats) -> float:
     if not np.any(coefficients):
         return float("inf")
     r = np.linspace(0, 20, 4001)[1:]
-    _, by_xy, _ = bend(np.stack([r, np.zeros_like(r)], -1), np.where(np.arange(len(coefficients)) // 2 == 1, 0, coefficients))
+    _, by_xy, _ = bend(
+        np.stack([r, np.zeros_like(r)], -1), np.where(np.arange(len(coefficients)) // 2 == 1, 0, coefficients)
+    )
     folded = np.flatnonzero(~(by_xy[:, 0, 0] > 0) | ~(by_xy[:, 1, 1] > 0))
     return float(r[folded[0]] - r[0]) if len(folded) else float(r[-1])
 

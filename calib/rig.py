@@ -137,7 +137,9 @@ def read_calibration(path: str | Path) -> RigCalibration:
     try:
         table = json.loads(text, parse_constant=_no_constant, parse_int=_short_int)
     except (ValueError, RecursionError) as error:
-        raise DataError("the calibration is not valid JSON", value=f"{source}: {error or 'nested too deeply'}") from None
+        raise DataError(
+            "the calibration is not valid JSON", value=f"{source}: {error or 'nested too deeply'}"
+        ) from None
     return calibration_of(table, str(source))
 
 
