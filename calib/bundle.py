@@ -6,7 +6,7 @@ the normal matrix of the shared parameters, and with it their covariance, falls 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from spikerig.dataset.errors import NumericsError
 from spikerig.dataset.scene import Camera
 
 Floats = NDArray[np.float64]
+STAY = np.eye(4)[:3]
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +36,11 @@ class Sight:
     height: int
     sigma_px: float = 1.0
 
+    @property
+    def views(self) -> NDArray[np.bool_]:
+        """bool[V]: where any of the board was seen."""
+        return np.asarray(self.seen.any(axis=1))
+
     def flipped(self) -> Sight:
         """The same picture seen in a mirror (left and right swapped)."""
         return replace(self, px=np.stack([self.width - self.px[..., 0], self.px[..., 1]], -1))
@@ -42,11 +48,11 @@ class Sight:
 
 @dataclass(frozen=True, slots=True)
 class Guess:
-    """Where a fit starts: lenses as (K, coefficients), poses first_from_board [V,3,4], second_from_first [3,4]."""
+    """Where a fit starts: lenses (K, coefficients), poses first_from_board [V,3,4], step second_from_first [3,4]."""
 
     lenses: tuple[tuple[Floats, Floats], ...]
     poses: Floats
-    step: Floats | None = None
+    step: Floats = field(default_factory=lambda: STAY)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +71,7 @@ class Fit:
 
     lenses: tuple[tuple[Floats, Floats], ...]
     poses: Floats
-    step: Floats | None
+    step: Floats
     off_px: tuple[Floats, ...]
     used: tuple[NDArray[np.bool_], ...]
     cov: Floats
@@ -142,7 +148,7 @@ class _Problem:
         for k, sight in enumerate(self.sights):
             turned = self.board @ state.poses[:, :, :3].transpose(0, 2, 1)  # [V,N,3]
             p = turned + state.poses[:, None, :, 3]
-            if k and state.step is not None:
+            if k:
                 p = p @ state.step[:, :3].T + state.step[:, 3]
             K, c = state.lenses[k]
             z = np.where(np.abs(p[..., 2:]) < 1e-9, 1e-9, p[..., 2:])
@@ -193,7 +199,7 @@ class _Problem:
             shared[..., at + 4 : at + 4 + len(coefficients)] = f[:, None] * by_k[..., : len(coefficients)]
         by_turn = -cross_matrix(turned)
         by_first = by_p
-        if k and state.step is not None:
+        if k:
             if self.free_turn:
                 at = names.index("turn_x")
                 shared[..., at : at + 3] = by_p @ -cross_matrix(p - state.step[:, 3])
@@ -214,7 +220,7 @@ class _Problem:
                 coefficients, at = coefficients + d[4:], at + 4 + n
             lenses.append((K, coefficients))
         step = state.step
-        if step is not None:
+        if len(self.sights) == 2:
             w = shared[at : at + 3] if self.free_turn else np.zeros(3)
             shift = shared[len(shared) - 3 :] if self.free_shift else np.zeros(3)
             step = np.concatenate([turn(w) @ step[:, :3], (step[:, 3] + shift)[:, None]], 1)
@@ -307,7 +313,7 @@ def _told(problem: _Problem, state: Guess, A: Floats, B: Floats, C: Floats, cost
     off, _ = problem.residuals(state)
     used = tuple(s.seen & problem.use[:, None] for s in problem.sights)
     names = problem.names(state.lenses)
-    views = int((sum(u.any(1).astype(int) for u in used) > 0).sum())
+    views = int(np.any([u.any(axis=1) for u in used], axis=0).sum())
     dof = max(2 * sum(int(u.sum()) for u in used) - len(names) - 6 * views, 1)
     empty = np.einsum("vii->v", C) == 0
     inner = np.linalg.solve(C + (empty[:, None, None] + 1e-12) * np.eye(6), B.transpose(0, 2, 1))

@@ -125,7 +125,7 @@ def _of(sight: Sight, views: NDArray[np.bool_]) -> Sight:
 def report(measured: Measured, forced: bool = False) -> dict[str, Any]:
     """The report as JSON-ready values; numbers that no fit gave are None."""
     fit, verdict, seen = measured.fit, measured.verdict, measured.seen
-    pairs = seen.spike.seen.any(1) & seen.rgb.seen.any(1)
+    pairs = seen.spike.views & seen.rgb.views
     told: dict[str, Any] = {
         "accepted": verdict.accepted,
         "forced": forced and not verdict.accepted,

@@ -37,7 +37,7 @@ class Mono:
     @property
     def views(self) -> NDArray[np.bool_]:
         """bool[V]: where the board was seen."""
-        return self.sight.seen.any(1)
+        return self.sight.views
 
     def mirrored(self) -> Mono:
         """The same camera behind a mirror that swaps left and right; the board's labels are swapped with it."""
@@ -56,7 +56,8 @@ def fit_lens(board: Floats, sight: Sight, lenses: Sequence[int] = LENSES) -> Mon
 
     How many coefficients the lens gets is decided by what they foretell: the views are fitted without every fifth of
     them in turn, and the ones left out are then explained by their board pose alone. A further coefficient must lower
-    that residual by `WORTH`, and the lens must stay one to one within the picture. (Criteria that count corners as independent take eight coefficients from four views.)
+    that residual by `WORTH`, and the lens must stay one to one within the picture. (Criteria that count corners as
+    independent take eight coefficients from four views.)
 
     Args:
         board: float64[N,3], z = 0.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.calib.boards import Board, Found
-from spikerig.calib.bundle import Fit, Guess, Sight, solve
+from spikerig.calib.bundle import Fit, Guess, Sight, solve, turn
 from spikerig.calib.crop import grid, parallax_px, rgb_px_from_spike_px, spike_px_from_rgb_px
 from spikerig.calib.evidence import f_above, hotelling, jackknife_cov
 from spikerig.calib.lens import LENSES, stored
@@ -160,7 +160,6 @@ class _Joint:
     def solve_stereo(self) -> tuple[Fit, bool]:
         """The fit with two centres, and whether the lenses had to be held."""
         step = self.match.fit.step
-        assert step is not None  # noqa: S101 - two arms
         guess = self.guess(step)
         free = solve(self.points, self.sights, guess, use=self.use)
         if free.chi2 / free.dof <= STRAINED**2:
@@ -168,7 +167,6 @@ class _Joint:
         return solve(self.points, self.sights, guess, use=self.use, free_lens=False), True
 
     def solve_common(self, stereo: Fit, held: bool) -> Fit:
-        assert stereo.step is not None  # noqa: S101
         step = np.concatenate([stereo.step[:, :3], np.zeros((3, 1))], 1)
         guess = Guess(stereo.lenses, stereo.poses, step)
         return solve(self.points, self.sights, guess, use=self.use, free_lens=not held, free_shift=False)
@@ -182,7 +180,7 @@ class _Joint:
             use[v] = False
             if not (use & self.match.agree).any():
                 continue
-            shift = bool(fit.step is not None and fit.step[:, 3].any())
+            shift = bool(fit.step[:, 3].any())
             again = solve(self.points, self.sights, Guess(fit.lenses, fit.poses, fit.step), use=use, most=6,
                           free_lens=not held, free_shift=shift)  # fmt: skip
             rows[v] = parameters(again, fit)[1]
@@ -196,8 +194,6 @@ def parameters(fit: Fit, near: Fit) -> tuple[tuple[str, ...], Floats]:
     for arm, (K, c) in zip(("spike", "rgb"), fit.lenses, strict=True):
         names += [f"{arm}.{n}_px" for n in ("fx", "fy", "cx", "cy")] + [f"{arm}.{n}" for n in _COEFFICIENTS[: len(c)]]
         values += [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *c]
-    assert fit.step is not None  # noqa: S101
-    assert near.step is not None  # noqa: S101
     R = fit.step[:, :3] @ near.step[:, :3].T
     names += ["turn_x_rad", "turn_y_rad", "turn_z_rad", "shift_x_mm", "shift_y_mm", "shift_z_mm"]
     values += [*(np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2), *fit.step[:, 3]]
@@ -212,7 +208,6 @@ def _chance(stereo: Fit, common: Fit, left_out: Floats, views: int) -> float:
 
     Views are the independent samples (corners of one view share its errors): Hotelling's test on the jackknife.
     """
-    assert stereo.step is not None  # noqa: S101
     if views >= ENOUGH:
         return hotelling(stereo.step[:, 3], jackknife_cov(left_out[:, -3:]), views)
     gain = max(common.chi2 - stereo.chi2, 0.0) / 3
@@ -231,7 +226,6 @@ def _parallax_sd_px(record: RigCalibration, stereo: Fit, left_out: Floats) -> fl
 
 def _record(fit: Fit, joint: _Joint, model: Model, mirrored: Arm | None) -> RigCalibration:
     """The record of a joint fit, without its uncertainties."""
-    assert fit.step is not None  # noqa: S101
     cameras = [
         Camera(K, stored(c), s.width, s.height) for (K, c), s in zip(fit.lenses, joint.sights, strict=True)
     ]  # fmt: skip
@@ -267,7 +261,7 @@ def _told(
     moved = np.full(len(left_out), np.nan)
     for v in np.flatnonzero(np.isfinite(left_out).all(1)):
         moved[v] = np.nanmax(np.linalg.norm(crop(left_out[v]) - here, axis=-1), initial=0)
-    shift = fit.step[:, 3] if fit.step is not None else np.zeros(3)
+    shift = fit.step[:, 3]
     unit = shift / max(float(np.linalg.norm(shift)), 1e-300)
     worst = float(np.nanmax(crop_sd)) if np.isfinite(crop_sd).any() else float("inf")
     sd["baseline_mm"] = float(np.sqrt(max(unit @ free[-3:, -3:] @ unit, 0)))
@@ -303,9 +297,6 @@ def _second(lens: Mapping[str, str]) -> dict[str, str]:
 
 def _with(record: RigCalibration, fit: Fit, names: tuple[str, ...], values: Floats) -> RigCalibration:
     """The record with other parameters: lenses, the step's turn and shift."""
-    from spikerig.calib.bundle import turn
-
-    assert fit.step is not None  # noqa: S101
     made: dict[str, Any] = {}
     at = 0
     for arm, (K, c) in zip(("spike", "rgb"), fit.lenses, strict=True):

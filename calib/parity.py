@@ -18,8 +18,9 @@ from spikerig.calib.lens import bend
 from spikerig.calib.mono import Mono
 
 Floats = NDArray[np.float64]
-AGREE = 1e-3  # of a picture's diagonal: how far off a pair may be and still belong (0.5 px at 400x250)
-CAP = 5e-3  # of the diagonal: a pair further off than this counts as this far
+FINE = 3e-4  # of the RGB picture's diagonal: a pair no further off belongs (0.7 px of 1920x1080)
+CAP = 5e-3  # of the diagonal: a pair further off does not, and counts as this far
+ODD = 6.0  # in between it belongs if it is no more than this many times as far off as most
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,21 +79,18 @@ def _match(board: Board, first: Mono, second: Mono, flip: bool) -> Match:
     lenses = (first.fit.lenses[0], second.fit.lenses[0])
     off = _transfer(second, times(step, first.fit.poses), points)
     agree = pairs & (off <= max(CAP * diagonal, 3 * float(np.min(off[pairs], initial=np.inf))))
-    poses = first.fit.poses
+    poses, fit = first.fit.poses, first.fit
     for _ in range(3):
         # a board's pose is started from the arm that explains the pair better
         other = times(inverse(step), second.fit.poses)
-        poses = np.where((_pair_cost(points, sights, lenses, other, step)
-                          < _pair_cost(points, sights, lenses, poses, step))[:, None, None], other, poses)  # fmt: skip
-        guess = Guess(lenses, poses, step)
+        better = _pair_cost(points, sights, lenses, other, step) < _pair_cost(points, sights, lenses, poses, step)
+        guess = Guess(lenses, np.where(better[:, None, None], other, poses), step)
         fit = solve(points, sights, guess, use=agree, free_lens=False, most=30)
-        assert fit.step is not None  # noqa: S101 - two sights
         step = fit.step
-        settled = solve(points, sights, Guess(lenses, fit.poses, step), use=pairs, most=20,
-                        free_lens=False, free_turn=False, free_shift=False)  # fmt: skip
-        poses = settled.poses
+        held = {"free_lens": False, "free_turn": False, "free_shift": False}
+        poses = solve(points, sights, Guess(lenses, fit.poses, step), use=pairs, most=20, **held).poses
         off = np.where(pairs, np.sqrt(_pair_cost(points, sights, lenses, poses, step)), np.nan)
-        near = pairs & (off <= max(AGREE * diagonal, 4 * float(np.median(off[agree])) if agree.any() else 0))
+        near = pairs & (off <= np.clip(ODD * np.median(off[agree]), FINE * diagonal, CAP * diagonal))
         if (near == agree).all() or not near.any():
             break
         agree = near

@@ -149,7 +149,7 @@ def calibration_of(table: Any, source: str = "the calibration") -> RigCalibratio
         found = table.get("schema") if isinstance(table, dict) else type(table).__name__
         raise DataError("not a calibration of this tool", value=f"{source}: {str(found)[:80]}", expected=SCHEMA)
     read = _Reader(table)
-    known = {f for f in RigCalibration.__slots__} | {"schema", "id", "report"}
+    known = set(RigCalibration.__slots__) | {"schema", "id", "report"}
     read.faults += [f"{str(k)[:40]!r} is not a field of a calibration" for k in table if k not in known]
     near, far = read.numbers("depth_mm", (2,), none_ok=True)
     mirrored, model = read.choice("mirrored", (None, "spike", "rgb")), read.choice("model", ("common", "stereo"))
@@ -260,8 +260,9 @@ def _array(value: Any, shape: tuple[int, ...], none_ok: bool) -> NDArray[np.floa
     if not shape:
         if value is None and none_ok:
             return np.array(np.nan)
-        plain = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
-        return np.array(float(value)) if plain else None
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
+            return None
+        return np.array(float(value))
     if not isinstance(value, list) or len(value) != shape[0]:
         return None
     rows = [_array(v, shape[1:], none_ok) for v in value]

@@ -109,10 +109,12 @@ def read_picture(path: Path, reading: Reading) -> NDArray[Any]:
     if path.suffix.lower() in SUFFIXES:
         pixels = read_image(path)
         return pixels[:, :, 0] if pixels.shape[2] == 1 else pixels[:, :, :3].mean(2, dtype=np.float32)
-    layout = {k: getattr(reading, k) for k in ("height", "width", "row_bits", "axes")}
-    if path.suffix.lower() in (".npz", ".h5"):
-        layout = {"axes": reading.axes if path.suffix.lower() == ".npz" else None}
-    with open_spikes(path, **layout) as file:
+    kind = path.suffix.lower()
+    if kind in (".npz", ".h5"):
+        with open_spikes(path, axes=reading.axes if kind == ".npz" else None) as file:
+            return still_light(file, reading)
+    raster = {"height": reading.height, "width": reading.width, "row_bits": reading.row_bits}
+    with open_spikes(path, **raster) as file:  # type: ignore[arg-type]
         return still_light(file, reading)
 
 
@@ -146,7 +148,7 @@ def still_light(file: SpikeFile, reading: Reading) -> NDArray[np.float32]:
         if not all(p.known.all() for p in pair):
             break
         shifts = [cv2.phaseCorrelate(here, cv2.GaussianBlur(p.light, (0, 0), 1.5))[0] for p in pair]
-        if max(np.hypot(*s) for s in shifts) > STILL_PX:
+        if max(float(np.hypot(s[0], s[1])) for s in shifts) > STILL_PX:
             break
         total, count = total + pair[0].light + pair[1].light, count + 2
     return (total / count).astype(np.float32)

@@ -12,14 +12,14 @@ from spikerig.calib.boards import Board
 from spikerig.calib.bundle import Sight
 from spikerig.calib.mono import ENOUGH
 from spikerig.calib.optics import RigFit
-from spikerig.calib.parity import AGREE
 
 Floats = NDArray[np.float64]
 MIN_VIEWS = 4
 GOOD_VIEWS = 10
 FOCAL_SD = 0.03  # of the focal length: more than this and the boards have not fixed it
 MONO = 2e-3  # of the diagonal: corners this far from any lens are not corners of this board
-FAR_ABOVE = 3.0  # a stereo residual so many times the mono one is far above it
+APART = 1e-3  # of the diagonal: arms that together fit no better than this are not one rig...
+FAR_ABOVE = 3.0  # ... where each alone fits so many times better
 REPEAT = 0.6e-3  # of the diagonal: a board that moved less between two views is the same view twice
 CROP_PX = 0.25
 
@@ -82,36 +82,42 @@ def _same_place(sight: Sight, u: int, v: int) -> bool | None:
 
 def judge_views(board: Board, seen: Seen, verdict: Verdict) -> NDArray[np.bool_]:
     """Faults of the views themselves; returns which views to fit, bool[V]."""
-    copies = [_copies(seen, arm) for arm in (0, 1)]
-    for arm, found in zip(("spike", "RGB"), copies, strict=True):
+    for arm, found in (("spike", _copies(seen, 0)), ("RGB", _copies(seen, 1))):
         if found:
-            verdict.refuse("duplicates", f"duplicates: the same {arm} picture serves as {_list(found)}. A picture "
-                           "counted twice makes a result look surer than it is, and one paired twice is wrong: remove "
-                           "the copies")  # fmt: skip
+            verdict.refuse(
+                "duplicates",
+                f"duplicates: the same {arm} picture serves as {_list(found)}. A picture counted twice makes a result "
+                "look surer than it is, and one paired twice is wrong: remove the copies",
+            )
     same = repeats(seen)
-    still = np.flatnonzero(same >= 0)
-    if len(still):
-        verdict.warnings.append(f"the board had not moved in {_list(seen.names[v] for v in still)}: these views are "
-                                "left out")  # fmt: skip
-    pairs = seen.spike.seen.any(1) & seen.rgb.seen.any(1) & (same < 0)
-    for arm, sight in (("spike", seen.spike), ("RGB", seen.rgb)):
-        found = int(sight.seen.any(1).sum())
-        if found < len(seen.names):
-            missing = [n for n, s in zip(seen.names, sight.seen.any(1), strict=True) if not s]
-            verdict.warnings.append(f"no whole board in {len(missing)} of {len(seen.names)} {arm} pictures: "
-                                    + _list(missing))  # fmt: skip
+    still = [name for name, s in zip(seen.names, same, strict=True) if s >= 0]
+    if still:
+        verdict.warnings.append(f"the board had not moved in {_list(still)}: these views are left out")
+    saw = seen.spike.views, seen.rgb.views
+    for arm, found in (("spike", saw[0]), ("RGB", saw[1])):
+        missing = [name for name, s in zip(seen.names, found, strict=True) if not s]
+        if missing:
+            verdict.warnings.append(
+                f"no whole board in {len(missing)} of {len(seen.names)} {arm} pictures: {_list(missing)}"
+            )
+    pairs = int((saw[0] & saw[1] & (same < 0)).sum())
     other = {(max(s), min(s)) for s in seen.sizes if set(s) != {board.cols, board.rows}}
-    few = 2 * int(pairs.sum()) < len(seen.names)
-    if other and few:
+    if other and 2 * pairs < len(seen.names):
         sizes = " or ".join(f"{c}x{r}" for c, r in sorted(other))
-        verdict.refuse("wrong-pattern", f"wrong pattern: the pictures show a board of {sizes} inner corners, not "
-                       f"{board.cols}x{board.rows}. Count INNER corners (squares less one) and give --pattern {sizes}")  # fmt: skip
-    if pairs.sum() < MIN_VIEWS:
-        verdict.refuse("too-few-views", f"too few views: {int(pairs.sum())} different pairs show the whole board to both "
-                       f"arms, at least {MIN_VIEWS} are needed and {GOOD_VIEWS} or more are good. Shoot more, the board "
-                       "wholly in view of both arms, sharp, lit evenly, tilted each time another way")  # fmt: skip
-    elif pairs.sum() < GOOD_VIEWS:
-        verdict.warnings.append(f"only {int(pairs.sum())} views; {GOOD_VIEWS} or more are good")
+        verdict.refuse(
+            "wrong-pattern",
+            f"wrong pattern: the pictures show a board of {sizes} inner corners, not {board.cols}x{board.rows}. Count "
+            f"INNER corners (squares less one) and give --pattern {sizes}",
+        )
+    if pairs < MIN_VIEWS:
+        verdict.refuse(
+            "too-few-views",
+            f"too few views: {pairs} different pairs show the whole board to both arms, at least {MIN_VIEWS} are "
+            f"needed and {GOOD_VIEWS} or more are good. Shoot more, the board wholly in view of both arms, sharp, lit "
+            "evenly, tilted each time another way",
+        )
+    elif pairs < GOOD_VIEWS:
+        verdict.warnings.append(f"only {pairs} views; {GOOD_VIEWS} or more are good")
     return same < 0
 
 
@@ -130,8 +136,9 @@ def judge_fit(fit: RigFit, names: Sequence[str], verdict: Verdict) -> None:
         return  # what else is known of the step between the arms means nothing
     worst = float(np.nanmax(fit.crop_sd_px)) if np.isfinite(fit.crop_sd_px).any() else np.inf
     if worst > CROP_PX:
-        verdict.warnings.append(f"the crop is only known to {worst:.2f} px at the rim of the spike picture: show the "
-                                "board there too")  # fmt: skip
+        verdict.warnings.append(
+            f"the crop is only known to {worst:.2f} px at the rim of the spike picture: show the board there too"
+        )
     left = fit.crop_left_out_px
     if np.isfinite(left).any() and np.nanmax(left) > 2 * CROP_PX:
         v = int(np.nanargmax(left))
@@ -146,28 +153,41 @@ def judge_fit(fit: RigFit, names: Sequence[str], verdict: Verdict) -> None:
             f"by up to {fit.parallax_px:.2f} spike px"
         )
     elif fit.bound_px > CROP_PX:
-        verdict.warnings.append(f"one centre is assumed, but the boards cannot tell it from a baseline that would put "
-                                f"the crop off by {fit.bound_px:.2f} px: show the board nearer and farther")  # fmt: skip
+        verdict.warnings.append(
+            "one centre is assumed, but the boards cannot tell it from a baseline that would put the crop off by "
+            f"{fit.bound_px:.2f} px: show the board nearer and farther"
+        )
 
 
 def _judge_lenses(fit: RigFit, verdict: Verdict) -> None:
-    for arm, mono in (("spike", fit.spike), ("rgb", fit.rgb)):
-        label = "spike" if arm == "spike" else "RGB"
-        diagonal, rms = _diagonal(mono.sight), mono.fit.rms_px()
-        if rms > MONO * diagonal:
-            verdict.refuse("bad-corners", f"the {label} arm alone fits its corners only to {rms:.2f} px. Is the board "
-                           "flat and rigid, were pictures sharp, is --pattern right?")  # fmt: skip
-        f, sd = mono.fit.lenses[0][0][0, 0], max(mono.fit.sd("fx0"), mono.fit.sd("fy0"))
-        joint = max(fit.sd[f"{arm}.fx_px"], fit.sd[f"{arm}.fy_px"])
-        several = len(fit.left_out[np.isfinite(fit.left_out).all(1)]) >= ENOUGH
-        scatter = max(fit.jackknife[f"{arm}.fx_px"], fit.jackknife[f"{arm}.fy_px"]) if several else 0.0
-        unsure = max(min(sd, joint) if joint > 0 else sd, scatter) / f
-        if not unsure <= FOCAL_SD or not np.isfinite(unsure):
+    for arm, label, mono in (("spike", "spike", fit.spike), ("rgb", "RGB", fit.rgb)):
+        rms = mono.fit.rms_px()
+        if rms > MONO * _diagonal(mono.sight):
+            verdict.refuse(
+                "bad-corners",
+                f"the {label} arm alone fits its corners only to {rms:.2f} px. Is the board flat and rigid, were "
+                "pictures sharp, is --pattern right?",
+            )
+        f, unsure = float(mono.fit.lenses[0][0][0, 0]), focal_sd(fit, arm)
+        if not unsure <= FOCAL_SD:
             tilts = np.linalg.norm(tilt_deg(mono.fit.poses[mono.views]), axis=1)
-            verdict.refuse("flat-boards", f"boards that barely tilt: the {label} focal length is {f:.0f} +- "
-                           f"{unsure * f:.3g} px ({100 * unsure:.3g} %, at most {100 * FOCAL_SD:.0f} % is kept), however "
-                           f"small the residual ({rms:.2f} px). Tilts were {tilts.min():.0f} to {tilts.max():.0f} deg, "
-                           "half of them should exceed 20: tilt the board left, right, up and down")  # fmt: skip
+            verdict.refuse(
+                "flat-boards",
+                f"boards that barely tilt: the {label} focal length is {f:.0f} +- {unsure * f:.3g} px "
+                f"({100 * unsure:.3g} %, at most {100 * FOCAL_SD:.0f} % is kept), however small the residual "
+                f"({rms:.2f} px). Tilts were {tilts.min():.0f} to {tilts.max():.0f} deg, half of them should exceed "
+                "20: tilt the board left, right, up and down",
+            )
+
+
+def focal_sd(fit: RigFit, arm: str) -> float:
+    """Relative standard deviation of an arm's focal length: the better of alone and joint, or by leaving views out."""
+    mono = fit.spike if arm == "spike" else fit.rgb
+    alone = max(mono.fit.sd("fx0"), mono.fit.sd("fy0"))
+    joint = max(fit.sd[f"{arm}.fx_px"], fit.sd[f"{arm}.fy_px"])
+    several = np.isfinite(fit.left_out).all(axis=1).sum() >= ENOUGH
+    scatter = max(fit.jackknife[f"{arm}.fx_px"], fit.jackknife[f"{arm}.fy_px"]) if several else 0.0
+    return float(max(min(alone, joint) if joint > 0 else alone, scatter) / mono.fit.lenses[0][0][0, 0])
 
 
 def _judge_pairs(fit: RigFit, names: Sequence[str], verdict: Verdict) -> bool:
@@ -176,23 +196,31 @@ def _judge_pairs(fit: RigFit, names: Sequence[str], verdict: Verdict) -> bool:
     pairs, agree = int(match.pairs.sum()), int(match.agree.sum())
     mono = float(np.hypot(fit.spike.fit.rms_px(), fit.rgb.fit.rms_px()) / np.sqrt(2))
     stereo = pair_rms_px(fit)
-    other = fit.other.score * diagonal if fit.other is not None else None
-    tried = "as they are and mirrored" if other is not None else "as they are"
-    far = stereo > FAR_ABOVE * mono and stereo > AGREE * diagonal
-    apart = 2 * agree <= pairs or far
+    apart = 2 * agree <= pairs or fit.fit.rms_px() > max(FAR_ABOVE * mono, APART * diagonal)
     if apart:
-        verdict.refuse("not-one-rig", f"stereo residual far above mono: the arms were tried {tried}, and together fit "
-                       f"only to {stereo:.2f} px where each alone fits to {mono:.2f}. The pairs were not shot at the same "
-                       "instant, are paired wrongly, or the arms moved against each other: hold the board still for each "
-                       "view, check which files belong together, and clamp the rig")  # fmt: skip
+        tried = "as they are and mirrored" if fit.other is not None else "as they are"
+        verdict.refuse(
+            "not-one-rig",
+            f"stereo residual far above mono: the arms were tried {tried}, and together fit only to {stereo:.2f} px "
+            f"where each alone fits to {mono:.2f}. The pairs were not shot at the same instant, are paired wrongly, or "
+            "the arms moved against each other: hold the board still for each view, check which files belong together, "
+            "and clamp the rig",
+        )
     elif agree < pairs:
-        odd = [f"{names[v]} ({match.off_px[v]:.1f} px)" for v in np.flatnonzero(match.pairs & ~match.agree)]
-        verdict.refuse("odd-pairs", f"not synchronous: {len(odd)} of {pairs} pairs do not fit the others: {_list(odd)}. "
-                       "The board moved between the two pictures, or they are paired wrongly: remove these pairs, or "
-                       "shoot them again with the board held still")  # fmt: skip
-    elif stereo > 2 * mono and stereo > 0.2 * AGREE * diagonal:
-        verdict.warnings.append(f"the arms together fit to {stereo:.2f} px, each alone to {mono:.2f}: was the board held "
-                                "still? Lenses were " + ("held as each arm alone found them" if fit.held else "refitted"))  # fmt: skip
+        odd = [f"{name} ({off:.1f} px)" for name, off, fits in zip(names, match.off_px, match.agree, strict=True)
+               if np.isfinite(off) and not fits]  # fmt: skip
+        verdict.refuse(
+            "odd-pairs",
+            f"not synchronous: {len(odd)} of {pairs} pairs do not fit the others: {_list(odd)}. The board moved "
+            "between the two pictures, or they are paired wrongly: remove these pairs, or shoot them again, the board "
+            "held still",
+        )
+    elif stereo > 2 * mono and stereo > 0.2 * APART * diagonal:
+        lenses = "held as each arm alone found them" if fit.held else "refitted together"
+        verdict.warnings.append(
+            f"the arms together fit to {stereo:.2f} px, each alone to {mono:.2f}: was the board held still? "
+            f"Lenses were {lenses}"
+        )
     return not apart
 
 
@@ -223,6 +251,5 @@ def _diagonal(sight: Sight) -> float:
     return float(np.hypot(sight.width, sight.height))
 
 
-def _list(names: Sequence[str] | object, most: int = 8) -> str:
-    found = [str(n) for n in names]  # type: ignore[attr-defined]
-    return ", ".join(found[:most]) + (f" and {len(found) - most} more" if len(found) > most else "")
+def _list(names: Sequence[str], most: int = 8) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
