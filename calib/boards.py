@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spikerig.calib.saddle import refine
 from spikerig.dataset.errors import UsageError
+from spikerig.dataset.images import srgb_from_linear
 
 Floats = NDArray[np.float64]
-SMALL = 800  # pictures narrower than this are doubled before corners are sought: measured 1.6 times as exact
+SMALL = 800  # pictures narrower than this are doubled before boards are sought: small squares are found then
 LARGEST = 60  # corners a side
 
 
@@ -100,21 +102,19 @@ def board_of(pattern: str, square_mm: float, charuco: str = "", marker_mm: float
     return Board(int(match[1]), int(match[2]), float(square_mm), charuco, float(marker_mm))
 
 
-def gray8(picture: NDArray[Any]) -> NDArray[np.uint8]:
-    """A picture as 8-bit gray whose range is used: from any dtype, [H,W] or [H,W,C]."""
-    gray = np.asarray(picture, np.float32)
-    gray = gray if gray.ndim == 2 else gray[:, :, :3].mean(2)
-    low, high = np.percentile(gray, (0.5, 99.5))
+def gray8(light: NDArray[Any]) -> NDArray[np.uint8]:
+    """Linear light [H,W] as 8-bit gray, encoded like sRGB, its range stretched: what detectors are used to."""
+    low, high = np.percentile(light, (0.5, 99.5))
     if not high > low:
-        return np.zeros(gray.shape, np.uint8)
-    return np.rint(np.clip((gray - low) * (255 / (high - low)), 0, 255)).astype(np.uint8)
+        return np.zeros(light.shape, np.uint8)
+    return np.rint(srgb_from_linear(np.clip((light - low) / (high - low), 0, 1)) * 255).astype(np.uint8)
 
 
-def find(picture: NDArray[Any], board: Board) -> Found | None:
+def find(light: NDArray[Any], board: Board) -> Found | None:
     """The board's corners in a picture, None where it is not (wholly) seen.
 
     Args:
-        picture: [H,W] or [H,W,C], any dtype; linear or encoded.
+        light: [H,W] linear light.
         board: which.
 
     Returns:
@@ -127,28 +127,29 @@ def find(picture: NDArray[Any], board: Board) -> Found | None:
         0.2 s for 400x250, 0.7 s for 1920x1080; twice that where there is no board.
 
     Source:
-        Duda and Frese 2018 (findChessboardCornersSB); classic detector with cornerSubPix as the fallback.
+        Duda and Frese 2018 (findChessboardCornersSB); the classic detector as the fallback; then `saddle.refine`.
     """
-    gray = gray8(picture)
-    if board.charuco:
-        return _find_charuco(gray, board)
+    gray = gray8(light)
+    found = _find_charuco(gray, board) if board.charuco else _find_plain(gray, board)
+    if found is None:
+        return None
+    return replace(found, px=refine(light, found.px, found.seen, board.cols, board.rows))
+
+
+def _find_plain(gray: NDArray[np.uint8], board: Board) -> Found | None:
     import cv2
 
+    size = (board.cols, board.rows)
+    everything = np.ones(board.cols * board.rows, bool)
     scales = (2, 1) if gray.shape[1] < SMALL else (1,)
     for more in (0, cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE):
         for scale in scales[: 1 if more else None]:
             large = gray if scale == 1 else cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-            ok, corners = cv2.findChessboardCornersSB(
-                large, (board.cols, board.rows), flags=cv2.CALIB_CB_ACCURACY | more
-            )
+            ok, corners = cv2.findChessboardCornersSB(large, size, flags=cv2.CALIB_CB_ACCURACY | more)
             if ok:
-                return _whole(ours(corners) / scale, "sb")
-    ok, corners = cv2.findChessboardCorners(gray, (board.cols, board.rows))
-    if not ok:
-        return None
-    window = int(np.clip(0.4 * _spacing(corners, board), 2, 11))
-    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
-    return _whole(ours(cv2.cornerSubPix(gray, corners, (window, window), (-1, -1), stop)), "classic")
+                return Found(ours(corners) / scale, everything, "sb")
+    ok, corners = cv2.findChessboardCorners(gray, size)
+    return Found(ours(corners), everything, "classic") if ok else None
 
 
 def ours(corners: NDArray[Any]) -> Floats:
@@ -156,25 +157,15 @@ def ours(corners: NDArray[Any]) -> Floats:
     return np.asarray(corners, np.float64).reshape(-1, 2) + 0.5
 
 
-def seen_size(picture: NDArray[Any]) -> tuple[int, int] | None:
+def seen_size(light: NDArray[Any]) -> tuple[int, int] | None:
     """How many inner corners (cols, rows) of whatever checkerboard is in a picture; None where there is none."""
     import cv2
 
-    gray = gray8(picture)
+    gray = gray8(light)
     if gray.shape[1] < SMALL:
         gray = cv2.resize(gray, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
     ok, _, labels = cv2.findChessboardCornersSBWithMeta(gray, (3, 3), cv2.CALIB_CB_LARGER)
     return (int(labels.shape[1]), int(labels.shape[0])) if ok and labels is not None else None
-
-
-def _whole(px: Floats, method: str) -> Found:
-    return Found(px, np.ones(len(px), bool), method)
-
-
-def _spacing(corners: NDArray[Any], board: Board) -> float:
-    grid = np.asarray(corners, np.float64).reshape(board.rows, board.cols, 2)
-    across, down = np.diff(grid, axis=1), np.diff(grid, axis=0)
-    return float(min(np.linalg.norm(across, axis=-1).min(), np.linalg.norm(down, axis=-1).min()))
 
 
 def _dictionary(name: str) -> Any:

@@ -17,6 +17,7 @@ from spikerig.dataset.scene import Camera
 
 Floats = NDArray[np.float64]
 STAY = np.eye(4)[:3]
+SHORTEST, LONGEST = 0.1, 100.0  # focal lengths in picture widths: 157 to 0.6 degrees across
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,7 +273,7 @@ def solve(
     for _ in range(most):
         shared, poses = _step(A, B, C, a, c, damping)
         trial = problem.moved(state, shared, poses)
-        trial_cost = float(sum((o**2).sum() for o in problem.residuals(trial)[0])) if _sane(trial) else np.inf
+        trial_cost = float(sum((o**2).sum() for o in problem.residuals(trial)[0])) if _sane(problem, trial) else np.inf
         if trial_cost <= cost:
             gain = cost - trial_cost
             state, damping = trial, max(damping / 10, 1e-12)
@@ -288,10 +289,14 @@ def solve(
     return _told(problem, state, A, B, C, cost, converged)
 
 
-def _sane(state: Guess) -> bool:
-    return all(np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0 for K, _ in state.lenses) and bool(
-        np.isfinite(state.poses).all()
-    )
+def _sane(problem: _Problem, state: Guess) -> bool:
+    """Whether lenses are still lenses: boards that say nothing about the focal length let it run to 0 or away."""
+    ok = bool(np.isfinite(state.poses).all() and np.isfinite(state.step).all())
+    for (K, c), sight in zip(state.lenses, problem.sights, strict=True):
+        size = np.array([sight.width, sight.height])
+        f, middle = np.diag(K)[:2] / sight.width, K[:2, 2] / size
+        ok &= bool(np.all((f > SHORTEST) & (f < LONGEST)) and np.all(np.abs(middle - 0.5) < 1) and np.all(abs(c) < 1e4))
+    return ok
 
 
 def _step(A: Floats, B: Floats, C: Floats, a: Floats, c: Floats, damping: float) -> tuple[Floats, Floats]:

@@ -14,7 +14,7 @@ from spikerig.calib.bundle import Sight
 from spikerig.calib.crop import crop_homography, working_depth_mm
 from spikerig.calib.lens import LENSES
 from spikerig.calib.optics import MirrorHint, RigFit, fit_rig, sight_of
-from spikerig.calib.shots import Pair, Reading, content_hash, read_picture
+from spikerig.calib.shots import Pair, Reading, content_hash, read_light
 from spikerig.calib.verdict import Seen, Verdict, coverage, judge_fit, judge_views, pair_rms_px, tilt_deg
 from spikerig.dataset.errors import DataError, NumericsError, RigError
 
@@ -53,17 +53,17 @@ def look(
         names = []
         for arm, (path, reading) in enumerate(((pair.spike, spike), (pair.rgb, rgb))):
             try:
-                picture = read_picture(path, reading)
+                light = read_light(path, reading)
             except RigError as error:
                 broken.append(f"{path}: {error.what}" + ("" if error.value is None else f" ({error.value})"))
                 continue
-            here = find(picture, board)
+            here = find(light, board)
             if here is None and not board.charuco and len(sizes) < 6:
-                size = seen_size(picture)
+                size = seen_size(light)
                 sizes += [size] if size else []
             found[arm].append(here)
-            shapes[arm].add(picture.shape[:2])
-            names.append(content_hash(picture))
+            shapes[arm].add(light.shape)
+            names.append(content_hash(light))
         hashes.append((names[0], names[1]) if len(names) == 2 else ("", ""))
         done()
     if broken:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.calib.bundle import Fit, Guess, Sight, solve, turn
+from spikerig.calib.bundle import LONGEST, SHORTEST, Fit, Guess, Sight, solve, turn
 from spikerig.calib.lens import LENSES, directions, our_matrix
 from spikerig.dataset.errors import NumericsError
 from spikerig.dataset.scene import Camera
@@ -16,6 +16,8 @@ from spikerig.dataset.scene import Camera
 Floats = NDArray[np.float64]
 FOLDS = 5
 ENOUGH = 8  # views from which on lenses are compared
+ODD = 5.0  # a view this many times as far off as most, ...
+FINE = 3e-4  # ... and by more than this part of the diagonal (0.14 px of 400x250), was misread
 USUAL = 5  # OpenCV's default number of coefficients
 WORTH = 0.02  # a further lens coefficient must foretell unseen views this much better
 
@@ -28,11 +30,13 @@ class Mono:
         fit: of the views where the board was seen; other views keep a made-up pose.
         sight: what was fitted, `sigma_px` now the residual of a coordinate.
         foretold_px: number of lens coefficients -> residual of views that the fit had not seen.
+        odd: bool[V], views left out because their corners fit no lens that fits the others.
     """
 
     fit: Fit
     sight: Sight
     foretold_px: dict[int, float]
+    odd: NDArray[np.bool_]
 
     @property
     def views(self) -> NDArray[np.bool_]:
@@ -77,14 +81,16 @@ def fit_lens(board: Floats, sight: Sight, lenses: Sequence[int] = LENSES) -> Mon
     use = sight.seen.sum(1) >= 4
     if not use.any():
         raise NumericsError("no view shows the board", value=0)
+    odd = np.zeros_like(use)
+    for _ in range(3):
+        fits = _fits(board, sight, use, lenses)
+        off = fits[max(fits)].view_rms_px(0)
+        limit = max(ODD * float(np.nanmedian(off)), FINE * float(np.hypot(sight.width, sight.height)))
+        wrong = use & (np.nan_to_num(off) > limit)
+        if not wrong.any():
+            break
+        use, odd = use & ~wrong, odd | wrong
     sight = replace(sight, seen=sight.seen & use[:, None])
-    guess = _start(board, sight, use)
-    fits: dict[int, Fit] = {}
-    for n in sorted(lenses):
-        K, c = guess.lenses[0]
-        at = replace(guess, lenses=((K, np.concatenate([c, np.zeros(8)])[:n]),))
-        fits[n] = solve(board, (sight,), at, use=use)
-        guess = Guess(fits[n].lenses, fits[n].poses)
     covering = [n for n in fits if _covers(fits[n].camera(0, sight))] or [min(fits)]
     best = max((n for n in covering if n <= USUAL), default=min(covering))
     foretold: dict[int, float] = {}
@@ -94,7 +100,19 @@ def fit_lens(board: Floats, sight: Sight, lenses: Sequence[int] = LENSES) -> Mon
         for n in covering:
             best = n if foretold[n] < foretold[best] * (1 - WORTH) else best
     sigma = float(np.sqrt(fits[best].chi2 / fits[best].dof))
-    return Mono(fits[best], replace(sight, sigma_px=max(sigma, 1e-4)), foretold)
+    return Mono(fits[best], replace(sight, sigma_px=max(sigma, 1e-4)), foretold, odd)
+
+
+def _fits(board: Floats, sight: Sight, use: NDArray[np.bool_], lenses: Sequence[int]) -> dict[int, Fit]:
+    """A fit for each number of coefficients, each started from the one before."""
+    guess = _start(board, sight, use)
+    fits: dict[int, Fit] = {}
+    for n in sorted(lenses):
+        K, c = guess.lenses[0]
+        at = replace(guess, lenses=((K, np.concatenate([c, np.zeros(8)])[:n]),))
+        fits[n] = solve(board, (sight,), at, use=use)
+        guess = Guess(fits[n].lenses, fits[n].poses)
+    return fits
 
 
 def _foretold(board: Floats, sight: Sight, fit: Fit, use: NDArray[np.bool_]) -> float:
@@ -124,15 +142,25 @@ def _start(board: Floats, sight: Sight, use: NDArray[np.bool_]) -> Guess:
     objects = [board[sight.seen[v]].astype(np.float32) for v in views]
     images = [(sight.px[v][sight.seen[v]] - 0.5).astype(np.float32)[:, None] for v in views]
     size = (sight.width, sight.height)
-    fixed = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
+    straight = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
     try:
-        _, K, _, turns, shifts = cv2.calibrateCamera(objects, images, size, None, None, flags=fixed)  # type: ignore[call-overload]
+        _, K, _, turns, shifts = cv2.calibrateCamera(objects, images, size, None, None, flags=straight)  # type: ignore[call-overload]
+        if not _plausible(
+            np.asarray(K), sight
+        ):  # boards that barely tilt: take a usual lens, and poses that go with it
+            usual = np.array([[1.2 * size[0], 0, size[0] / 2], [0, 1.2 * size[0], size[1] / 2], [0, 0, 1]])
+            held = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_FOCAL_LENGTH | cv2.CALIB_FIX_PRINCIPAL_POINT
+            _, K, _, turns, shifts = cv2.calibrateCamera(
+                objects, images, size, usual, np.zeros(5), flags=straight | held
+            )
     except cv2.error as error:
         raise NumericsError("no camera fits these corners", value=str(error).splitlines()[0]) from error
     poses = np.tile(np.concatenate([np.eye(3), [[0.0], [0.0], [1e3]]], 1), (len(use), 1, 1))
     for v, w, t in zip(views, turns, shifts, strict=True):
         poses[v] = np.concatenate([turn(np.asarray(w, np.float64).ravel()), np.asarray(t, np.float64).reshape(3, 1)], 1)
-    K = our_matrix(np.asarray(K, np.float64))
-    if not np.isfinite(K).all() or not 0.05 * sight.width < K[0, 0] < 100 * sight.width:
-        K = np.array([[1.2 * sight.width, 0, sight.width / 2], [0, 1.2 * sight.width, sight.height / 2], [0, 0, 1]])
-    return Guess(((K, np.zeros(0)),), poses)
+    return Guess(((our_matrix(np.asarray(K, np.float64)), np.zeros(0)),), poses)
+
+
+def _plausible(K: Floats, sight: Sight) -> bool:
+    f, middle = K[0, 0] / sight.width, K[:2, 2] / (sight.width, sight.height)
+    return bool(np.isfinite(K).all() and 3 * SHORTEST < f < LONGEST / 10 and np.all((middle > 0) & (middle < 1)))

@@ -14,7 +14,7 @@ from spikerig.calib.bundle import Fit, Guess, Sight, solve, turn
 from spikerig.calib.crop import grid, parallax_px, rgb_px_from_spike_px, spike_px_from_rgb_px
 from spikerig.calib.evidence import f_above, hotelling, jackknife_cov
 from spikerig.calib.lens import LENSES, stored
-from spikerig.calib.mono import ENOUGH, Mono, fit_lens
+from spikerig.calib.mono import Mono, fit_lens
 from spikerig.calib.parity import Match, inverse, match_arms, times
 from spikerig.calib.rig import Arm, Model, RigCalibration
 from spikerig.dataset.errors import NumericsError
@@ -22,8 +22,10 @@ from spikerig.dataset.scene import Camera, Pose
 
 Floats = NDArray[np.float64]
 MirrorHint = Literal["auto", "none", "spike", "rgb"]
+MANY = 4  # views; with more than this the scatter over views is the judge
 CHANCE = 0.01  # a common centre is given up when the boards would show such parallax by chance less often than this
-UNSEEN_PX = 0.05  # parallax below this, uncertainty included, is none
+UNSEEN_PX = 0.1  # parallax below this, uncertainty included, is none
+SPLITTER_PX = 1.0  # more parallax than this is none of a beam splitter's, however few the views that show it
 STRAINED = 1.5  # lenses are held as each arm alone finds them where a joint fit would raise residuals by more
 
 
@@ -119,7 +121,7 @@ def fit_rig(
     trial = _record(stereo, joint, "stereo", mirrored)
     parallax = parallax_px(trial)
     bound = parallax + _parallax_sd_px(trial, stereo, left_out[use])
-    one_centre = chance >= CHANCE or bound < UNSEEN_PX
+    one_centre = (chance >= CHANCE and parallax < SPLITTER_PX) or bound < UNSEEN_PX
     chosen: Model = ("common" if one_centre else "stereo") if model == "auto" else model
     fit = common if chosen == "common" else stereo
     if chosen == "common":
@@ -208,7 +210,7 @@ def _chance(stereo: Fit, common: Fit, left_out: Floats, views: int) -> float:
 
     Views are the independent samples (corners of one view share its errors): Hotelling's test on the jackknife.
     """
-    if views >= ENOUGH:
+    if views > MANY:
         return hotelling(stereo.step[:, 3], jackknife_cov(left_out[:, -3:]), views)
     gain = max(common.chi2 - stereo.chi2, 0.0) / 3
     return f_above(gain / max(stereo.chi2 / stereo.dof, 1e-30), 3, stereo.dof)
@@ -253,7 +255,7 @@ def _told(
     def crop(values: Floats) -> Floats:
         return spike_px_from_rgb_px(_with(record, fit, names, values), rgb)
 
-    steps = np.where(np.diag(free) > 0, 1e-3 * np.sqrt(np.maximum(np.diag(free), 0)), 1.0)
+    steps = np.clip(1e-3 * np.sqrt(np.maximum(np.diag(free), 0)), 1e-9, 1e-3 * np.maximum(np.abs(at), 1e-2))
     slopes = np.stack([
         (crop(at + h * e) - crop(at - h * e)) / (2 * h) for h, e in zip(steps, np.eye(len(at)), strict=True)
     ], -1)  # fmt: skip

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.build import SPIKE_SUFFIXES, natural
 from spikerig.dataset.errors import DataError, UsageError
-from spikerig.dataset.images import SUFFIXES, read_image
+from spikerig.dataset.images import SUFFIXES, linear_from_srgb, read_image
 from spikerig.dataset.spikes import SpikeFile, open_spikes
 from spikerig.dataset.texture import tfp
 
@@ -100,15 +100,16 @@ def _last_number(stem: str) -> str | None:
     return str(int(numbers[-1])) if numbers and len(numbers[-1]) < 20 else None
 
 
-def read_picture(path: Path, reading: Reading) -> NDArray[Any]:
-    """A picture or a spike file's texture as gray [H,W]: encoded mean of a picture's channels, linear light of spikes.
+def read_light(path: Path, reading: Reading) -> NDArray[np.float32]:
+    """A picture or a spike file's texture as linear gray light, float32[H,W]; pictures are taken to be sRGB.
 
     Raises:
         DataError: the file is damaged, or its spikes are too short or lost.
     """
     if path.suffix.lower() in SUFFIXES:
-        pixels = read_image(path)
-        return pixels[:, :, 0] if pixels.shape[2] == 1 else pixels[:, :, :3].mean(2, dtype=np.float32)
+        pixels = read_image(path)[:, :, :3]
+        linear = pixels if pixels.dtype == np.float32 else linear_from_srgb(pixels)
+        return linear.mean(2, dtype=np.float32)
     kind = path.suffix.lower()
     if kind in (".npz", ".h5"):
         with open_spikes(path, axes=reading.axes if kind == ".npz" else None) as file:

@@ -16,7 +16,7 @@ from spikerig.calib.optics import RigFit
 Floats = NDArray[np.float64]
 MIN_VIEWS = 4
 GOOD_VIEWS = 10
-FOCAL_SD = 0.03  # of the focal length: more than this and the boards have not fixed it
+FOCAL_SD = 0.02  # of the focal length: more than this and the boards have not fixed it
 MONO = 2e-3  # of the diagonal: corners this far from any lens are not corners of this board
 APART = 1e-3  # of the diagonal: arms that together fit no better than this are not one rig...
 FAR_ABOVE = 3.0  # ... where each alone fits so many times better
@@ -131,7 +131,12 @@ def _copies(seen: Seen, arm: int) -> list[str]:
 
 def judge_fit(fit: RigFit, names: Sequence[str], verdict: Verdict) -> None:
     """Faults of a fitted rig; `names` are those of the views that were fitted."""
-    _judge_lenses(fit, verdict)
+    several = int(fit.match.pairs.sum())
+    if several < 2:
+        return
+    if several >= MIN_VIEWS and not _judge_lenses(fit, names, verdict):
+        verdict.warnings.append("whether the two arms agree cannot be told before both lenses are known")
+        return
     if not _judge_pairs(fit, names, verdict):
         return  # what else is known of the step between the arms means nothing
     worst = float(np.nanmax(fit.crop_sd_px)) if np.isfinite(fit.crop_sd_px).any() else np.inf
@@ -159,9 +164,14 @@ def judge_fit(fit: RigFit, names: Sequence[str], verdict: Verdict) -> None:
         )
 
 
-def _judge_lenses(fit: RigFit, verdict: Verdict) -> None:
+def _judge_lenses(fit: RigFit, names: Sequence[str], verdict: Verdict) -> bool:
+    """Whether both lenses are known."""
+    known = True
     for arm, label, mono in (("spike", "spike", fit.spike), ("rgb", "RGB", fit.rgb)):
         rms = mono.fit.rms_px()
+        if mono.odd.any():
+            misread = [name for name, odd in zip(names, mono.odd, strict=True) if odd]
+            verdict.warnings.append(f"{label} corners of {_list(misread)} fit no lens that fits the others: left out")
         if rms > MONO * _diagonal(mono.sight):
             verdict.refuse(
                 "bad-corners",
@@ -170,14 +180,16 @@ def _judge_lenses(fit: RigFit, verdict: Verdict) -> None:
             )
         f, unsure = float(mono.fit.lenses[0][0][0, 0]), focal_sd(fit, arm)
         if not unsure <= FOCAL_SD:
+            known = False
             tilts = np.linalg.norm(tilt_deg(mono.fit.poses[mono.views]), axis=1)
             verdict.refuse(
                 "flat-boards",
                 f"boards that barely tilt: the {label} focal length is {f:.0f} +- {unsure * f:.3g} px "
                 f"({100 * unsure:.3g} %, at most {100 * FOCAL_SD:.0f} % is kept), however small the residual "
-                f"({rms:.2f} px). Tilts were {tilts.min():.0f} to {tilts.max():.0f} deg, half of them should exceed "
-                "20: tilt the board left, right, up and down",
+                f"({rms:.2f} px). As fitted, tilts were {tilts.min():.0f} to {tilts.max():.0f} deg, half of them "
+                "should exceed 20: tilt the board left, right, up and down",
             )
+    return known
 
 
 def focal_sd(fit: RigFit, arm: str) -> float:

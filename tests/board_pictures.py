@@ -10,7 +10,7 @@ from spikerig.dataset.kernels import fire
 from spikerig.dataset.scene import Camera
 from spikerig.dataset.spikes import SpikeStream
 
-COLS, ROWS, SQUARE = 9, 6, 24.0
+COLS, ROWS, SQUARE = 9, 6, 16.0  # mm
 
 
 def corners(cols: int = COLS, rows: int = ROWS, square: float = SQUARE) -> np.ndarray:
@@ -21,7 +21,11 @@ def corners(cols: int = COLS, rows: int = ROWS, square: float = SQUARE) -> np.nd
 
 @dataclass
 class Lens:
-    """A camera that casts `samples` x `samples` rays a pixel; its directions are found once."""
+    """A camera that casts `samples` x `samples` rays a pixel; their directions are found once.
+
+    The rays lie staggered, all at different heights and all in different columns, so that an edge along the pixels
+    is as exact as any other.
+    """
 
     camera: Camera
     samples: int = 4
@@ -29,8 +33,11 @@ class Lens:
 
     def __post_init__(self) -> None:
         s, cam = self.samples, self.camera
-        x, y = ((np.arange(n * s) + 0.5) / s for n in (cam.width, cam.height))
-        self.rays = directions(cam, np.stack(np.meshgrid(x, y), -1))[..., :2].astype(np.float32)
+        i, j = np.meshgrid(np.arange(s), np.arange(s))
+        px = np.stack([(i + (j + 0.5) / s) / s, (j + (i + 0.5) / s) / s], -1).reshape(-1, 2)  # within a pixel
+        x, y = np.meshgrid(np.arange(cam.width), np.arange(cam.height))
+        here = np.stack([x, y], -1)[None] + px[:, None, None]
+        self.rays = directions(cam, here)[..., :2].astype(np.float32)
 
     def picture(self, pose: np.ndarray, black: float = 0.05, white: float = 0.8, behind: float = 0.3,
                 cols: int = COLS, rows: int = ROWS, square: float = SQUARE) -> np.ndarray:  # fmt: skip
@@ -43,25 +50,27 @@ class Lens:
         light = np.where(dark == 1, np.float32(black), np.float32(white))
         light[(i < 0) | (i > cols + 1) | (j < 0) | (j > rows + 1)] = white
         light[(i < -1) | (i > cols + 2) | (j < -1) | (j > rows + 2) | (w <= 0)] = behind
-        s = self.samples
-        return light.reshape(self.camera.height, s, self.camera.width, s).mean((1, 3))
+        return light.mean(0)
 
     def corners(self, pose: np.ndarray, **board: float) -> np.ndarray:
         """Where the corners truly are, float64[N,2]."""
         return project(self.camera, corners(**board) @ pose[:, :3].T + pose[:, 3])
 
 
-def poses(count: int, seed: int = 0, tilt_deg: float = 35, near: float = 330, far: float = 620) -> np.ndarray:
-    """spike_from_board float64[V,3,4]: tilted about random axes, near the axis, over a range of distances."""
+def poses(count: int, seed: int = 0, tilt_deg: float = 40, near: float = 330, far: float = 620) -> np.ndarray:
+    """spike_from_board float64[V,3,4]: tilted about random axes, at many depths, within 0.3 x 0.18 of the axis."""
     rng = np.random.default_rng(seed)
-    found = []
-    for k in range(count):
-        about = 2 * np.pi * (k / count + 0.05 * rng.standard_normal())
+    rim = corners() * [(COLS + 1.6) / (COLS - 1), (ROWS + 1.6) / (ROWS - 1), 1]
+    found: list[np.ndarray] = []
+    while len(found) < count:
+        about = 2 * np.pi * (len(found) / count + 0.05 * rng.standard_normal())
         w = np.radians(tilt_deg) * rng.uniform(0.5, 1) * np.array([np.cos(about), np.sin(about), 0])
         z = rng.uniform(near, far)
-        t = np.array([rng.uniform(-0.13, 0.13) * z, rng.uniform(-0.07, 0.07) * z, z])
+        t = np.array([rng.uniform(-0.25, 0.25) * z, rng.uniform(-0.15, 0.15) * z, z])
         R = turn(np.array([0, 0, rng.uniform(-0.25, 0.25)])) @ turn(w)
-        found.append(np.concatenate([R, t[:, None]], 1))
+        p = rim @ R.T + t
+        if np.all(np.abs(p[:, :2] / p[:, 2:]) < [0.3, 0.18]):
+            found.append(np.concatenate([R, t[:, None]], 1))
     return np.stack(found)
 
 
@@ -72,8 +81,8 @@ def spikes(light: np.ndarray, ticks: int, seed: int, *, noisy: bool = True, fpn:
     phase = rng.integers(0, 2**32, light.shape, dtype=np.uint32)
     if noisy:
         held = held / (1 + fpn * np.random.default_rng(99).standard_normal(light.shape)).astype(np.float32)
-        electrons = rng.poisson(np.repeat(held, ticks, 0) * 560).astype(np.float32) / 560
-        bits, _, _ = fire(electrons, np.arange(ticks + 1), phase, hold=True)
+        shot = rng.standard_normal((ticks, *light.shape), dtype=np.float32) * np.sqrt(held / 560)
+        bits, _, _ = fire(np.maximum(held + shot, 0), np.arange(ticks + 1), phase, hold=True)
     else:
         bits, _, _ = fire(held, np.array([0, ticks]), phase, hold=True)
     return SpikeStream(bits, light.shape[1], 40_000.0)
