@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.calib.lens import COEFFICIENTS, bend, stored
+from spikerig.calib.lens import COEFFICIENTS, bend, bent_only, stored
 from spikerig.dataset.errors import NumericsError
 from spikerig.dataset.scene import Camera
 
@@ -153,7 +153,7 @@ class _Problem:
                 p = p @ state.step[:, :3].T + state.step[:, 3]
             K, c = state.lenses[k]
             z = np.where(np.abs(p[..., 2:]) < 1e-9, 1e-9, p[..., 2:])
-            px = bend(p[..., :2] / z, c)[0] * np.diag(K)[:2] + K[:2, 2]
+            px = bent_only(p[..., :2] / z, c) * np.diag(K)[:2] + K[:2, 2]
             use = sight.seen & self.use[:, None]
             off.append(np.where(use[..., None] & np.isfinite(px), sight.px - px, 0.0) / sight.sigma_px)
             points.append((turned, p))
@@ -239,6 +239,7 @@ def solve(
     free_turn: bool = True,
     free_shift: bool = True,
     most: int = 60,
+    rest: float = 1e-10,
 ) -> Fit:
     """Fit lenses, board poses and the step between two cameras.
 
@@ -249,7 +250,7 @@ def solve(
         use: bool[V], views that count; default all.
         free_lens: fit the lenses, or hold them as guessed.
         free_turn, free_shift: of two cameras: fit the rotation and the shift between them, or hold them.
-        most: steps of the solver.
+        most: steps of the solver, which stops once a step gains less than `rest` of the cost.
 
     Returns:
         A Fit. A board pose that no used corner sees stays as guessed.
@@ -278,7 +279,7 @@ def solve(
             gain = cost - trial_cost
             state, damping = trial, max(damping / 10, 1e-12)
             A, B, C, a, c, cost = problem.normal(state)
-            if gain <= 1e-10 * cost + 1e-16:
+            if gain <= rest * cost + 1e-16:
                 converged = True
                 break
         else:

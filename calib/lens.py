@@ -58,6 +58,18 @@ def bend(xy: Floats, coefficients: Floats) -> tuple[Floats, Floats, Floats]:
     return bent, by_xy, np.stack(rows, -2)
 
 
+def bent_only(xy: Floats, coefficients: Floats) -> Floats:
+    """What `bend` does to directions, without the derivatives: a quarter of its cost."""
+    if not len(coefficients):
+        return xy
+    k1, k2, p1, p2, k3, k4, k5, k6 = np.concatenate([coefficients, np.zeros(8 - len(coefficients))])
+    x, y = xy[..., 0], xy[..., 1]
+    r2 = x * x + y * y
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    across = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    return np.stack([across, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], -1)
+
+
 def project(camera: Camera, points: ArrayLike) -> Floats:
     """Pixels of points in the camera's axes.
 
@@ -72,7 +84,7 @@ def project(camera: Camera, points: ArrayLike) -> Floats:
     with np.errstate(divide="ignore", invalid="ignore"):
         xy = p[..., :2] / p[..., 2:]
     ahead = (p[..., 2] > 0) & (np.hypot(xy[..., 0], xy[..., 1]) < reach(camera.distortion))
-    bent = bend(np.where(ahead[..., None], xy, 0), camera.distortion)[0]
+    bent = bent_only(np.where(ahead[..., None], xy, 0), camera.distortion)
     px = bent @ camera.K[:2, :2].T + camera.K[:2, 2]
     return np.where(ahead[..., None], px, np.nan)
 
@@ -105,8 +117,8 @@ def directions(camera: Camera, px: ArrayLike) -> Floats:
             det = np.where(np.abs(det) < 1e-12, 1e-12, det)
             step = np.stack([d * off[..., 0] - b * off[..., 1], a * off[..., 1] - c * off[..., 0]], -1) / det[..., None]
             xy = xy - step
-        bent = bend(xy, camera.distortion)[0]
-        xy = np.where((np.abs(bent - target).max(-1) < 1e-9)[..., None], xy, np.nan)
+        off = bent_only(xy, camera.distortion) - target
+        xy = np.where((np.abs(off).max(-1) < 1e-9)[..., None], xy, np.nan)
     return np.concatenate([xy, np.ones_like(xy[..., :1])], -1)
 
 

@@ -122,8 +122,8 @@ def _foretold(board: Floats, sight: Sight, fit: Fit, use: NDArray[np.bool_]) -> 
     for fold in range(min(FOLDS, len(views))):
         out = np.zeros(len(use), bool)
         out[views[fold :: min(FOLDS, len(views))]] = True
-        lens = solve(board, (sight,), Guess(fit.lenses, fit.poses), use=use & ~out, most=8).lenses
-        told = solve(board, (sight,), Guess(lens, fit.poses), use=out, free_lens=False, most=8)
+        lens = solve(board, (sight,), Guess(fit.lenses, fit.poses), use=use & ~out, most=8, rest=1e-6).lenses
+        told = solve(board, (sight,), Guess(lens, fit.poses), use=out, free_lens=False, most=8, rest=1e-6)
         total += told.chi2 if np.isfinite(told.chi2) else 1e12
     return float(np.sqrt(total / sight.seen.sum()))
 

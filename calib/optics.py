@@ -44,7 +44,8 @@ class RigFit:
         left_out: float64[V,P] of `names`: the parameters without each view; NaN for views not used.
         names: of `left_out` and `sd`: shared parameters, e.g. "spike.fx_px".
         sd, jackknife: standard deviation of each by the residuals and by leaving views out.
-        crop_sd_px: standard deviation of the crop over the spike picture, float64[4,5] (down, across).
+        crop_sd_px: standard deviation of the crop over the spike picture, float64[4,5] (down, across): the larger of
+            that by the residuals and that by leaving views out.
         crop_left_out_px: float64[V], how far the crop moves without that view, at most.
     """
 
@@ -183,7 +184,7 @@ class _Joint:
             if not (use & self.match.agree).any():
                 continue
             shift = bool(fit.step[:, 3].any())
-            again = solve(self.points, self.sights, Guess(fit.lenses, fit.poses, fit.step), use=use, most=6,
+            again = solve(self.points, self.sights, Guess(fit.lenses, fit.poses, fit.step), use=use, most=6, rest=1e-6,
                           free_lens=not held, free_shift=shift)  # fmt: skip
             rows[v] = parameters(again, fit)[1]
         return rows
@@ -259,10 +260,14 @@ def _told(
     slopes = np.stack([
         (crop(at + h * e) - crop(at - h * e)) / (2 * h) for h, e in zip(steps, np.eye(len(at)), strict=True)
     ], -1)  # fmt: skip
-    crop_sd = np.sqrt(np.einsum("...ip,pq,...iq->...", slopes, free, slopes))
+    spread = np.einsum("...ip,pq,...iq->...", slopes, free, slopes)
     moved = np.full(len(left_out), np.nan)
-    for v in np.flatnonzero(np.isfinite(left_out).all(1)):
-        moved[v] = np.nanmax(np.linalg.norm(crop(left_out[v]) - here, axis=-1), initial=0)
+    if len(rows) > 1:
+        crops = np.stack([crop(values) for values in rows]) - here
+        moved[np.isfinite(left_out).all(1)] = np.nanmax(np.linalg.norm(crops, axis=-1), axis=(1, 2), initial=0)
+        off = crops - crops.mean(0)
+        spread = np.fmax(spread, (off**2).sum((0, -1)) * (len(rows) - 1) / len(rows))
+    crop_sd = np.sqrt(spread)
     shift = fit.step[:, 3]
     unit = shift / max(float(np.linalg.norm(shift)), 1e-300)
     worst = float(np.nanmax(crop_sd)) if np.isfinite(crop_sd).any() else float("inf")

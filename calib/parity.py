@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from spikerig.calib.boards import Board
 from spikerig.calib.bundle import Fit, Guess, Sight, solve
-from spikerig.calib.lens import bend
+from spikerig.calib.lens import bent_only
 from spikerig.calib.mono import Mono
 
 Floats = NDArray[np.float64]
@@ -160,7 +160,7 @@ def _predicted(lens: tuple[Floats, Floats], poses: Floats, points: Floats) -> Fl
     p = points @ np.swapaxes(poses[:, :, :3], 1, 2) + poses[:, None, :, 3]
     z = p[..., 2:]
     with np.errstate(all="ignore"):
-        px = bend(p[..., :2] / z, lens[1])[0] * np.diag(lens[0])[:2] + lens[0][:2, 2]
+        px = bent_only(p[..., :2] / z, lens[1]) * np.diag(lens[0])[:2] + lens[0][:2, 2]
     return np.where((z > 0) & np.isfinite(px), px, 1e6)
 
 
