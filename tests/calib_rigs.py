@@ -35,7 +35,7 @@ def step_of(true: RigCalibration) -> np.ndarray:
 
 
 def corners_seen(true: RigCalibration, views: int, *, seed: int = 0, noise_seed: int | None = None,
-                 noise_px: tuple[float, float] = (0.03, 0.06), tilt_deg: float = 40, jitter_mm: float = 0,
+                 noise_px: tuple[float, float] = (0.015, 0.03), tilt_deg: float = 40, jitter_mm: float = 0,
                  shuffle: bool = False) -> tuple[Sight, Sight]:  # fmt: skip
     """Raw corners of both arms; `jitter_mm` moves the board between the two pictures, `shuffle` turns labels."""
     poses = bp.poses(views, seed, tilt_deg=tilt_deg)

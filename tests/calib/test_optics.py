@@ -29,7 +29,7 @@ def test_a_rig_is_found_whatever_its_mirror_and_labels(mirrored: str | None, shi
     assert fit.match.agree.all()
     assert fit.other is not None
     assert fit.other.score > 10 * fit.match.score
-    assert crop_error_px(found, true) < 0.1
+    assert crop_error_px(found, true) < 0.15
     assert abs(found.baseline_mm - true.baseline_mm) < 5 * max(fit.sd["baseline_mm"], 1e-9)
     assert found.spike.K[0, 0] == pytest.approx(620, abs=5 * fit.sd["spike.fx_px"])
     assert found.rgb.K[0, 2] == pytest.approx(true.rgb.K[0, 2], abs=5 * fit.sd["rgb.cx_px"])
@@ -40,10 +40,10 @@ def test_the_user_may_say_that_the_spike_arm_is_the_mirrored_one() -> None:
     sights = corners_seen(true, VIEWS, shuffle=True)
     told = fit_rig(BOARD, *sights, mirror="spike", lenses=(4,)).calibration
     assert told.mirrored == "spike"
-    assert crop_error_px(told, true) < 0.1
+    assert crop_error_px(told, true) < 0.15
     guessed = fit_rig(BOARD, *sights, lenses=(4,)).calibration  # a checkerboard cannot tell which arm it is
     assert guessed.mirrored == "rgb"
-    assert crop_error_px(guessed, true) < 0.1
+    assert crop_error_px(guessed, true) < 0.15
 
 
 def test_square_patterns_are_labelled_in_four_ways() -> None:
@@ -93,8 +93,8 @@ def test_a_misread_view_is_left_out() -> None:
 
 def test_no_view_in_common_is_said() -> None:
     first, second = corners_seen(rig(), 6)
-    first.seen.flags.writeable = second.seen.flags.writeable = True
-    first.seen[:3], second.seen[3:] = False, False
+    first, second = (dataclasses.replace(s, seen=s.seen & side) for s, side in (
+        (first, np.arange(6)[:, None] < 3), (second, np.arange(6)[:, None] >= 3)))  # fmt: skip
     with pytest.raises(NumericsError, match="both arms"):
         fit_rig(BOARD, first, second, lenses=(0,))
 
@@ -110,8 +110,8 @@ def test_good_views_are_accepted_and_reported_in_full() -> None:
     assert told["views_used"] == 10
     assert told["fx_px"] == pytest.approx(620, abs=2)
     assert told["baseline_mm"] == 0
-    assert told["rms_px"]["spike"] == pytest.approx(0.03 * np.sqrt(2), rel=0.1)
-    assert told["rms_px"]["rgb"] == pytest.approx(0.06 * np.sqrt(2), rel=0.1)
+    assert told["rms_px"]["spike"] == pytest.approx(0.015 * np.sqrt(2), rel=0.1)
+    assert told["rms_px"]["rgb"] == pytest.approx(0.03 * np.sqrt(2), rel=0.1)
     assert told["turn_deg"] == pytest.approx(np.linalg.norm([0.5, -1, 2]), abs=0.02)
     assert np.sum(told["coverage"]["spike"]) == 540
     assert max(abs(np.array(v["tilt_deg"])).max() for v in told["views"]) < 60
@@ -122,7 +122,7 @@ def test_good_views_are_accepted_and_reported_in_full() -> None:
 def test_boards_that_barely_tilt_are_refused_however_small_the_residual(tilt_deg: float) -> None:
     told = report(measure(BOARD, seen_of(corners_seen(rig(), 10, tilt_deg=tilt_deg)), lenses=(4,)))
     assert "flat-boards" in told["reason_codes"]
-    assert told["rms_px"]["spike"] < 0.1
+    assert told["rms_px"]["spike"] < 0.15
 
 
 def test_pairs_shot_at_different_instants_are_refused_in_both_parities() -> None:
