@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.calib.lens import COEFFICIENTS, bend, bent_only, stored
+from spikerig.calib.lens import COEFFICIENTS, bend, bent_only, by_coefficients, stored
 from spikerig.dataset.errors import NumericsError
 from spikerig.dataset.scene import Camera
 
@@ -186,7 +186,7 @@ class _Problem:
         K, coefficients = state.lenses[k]
         z = np.where(np.abs(p[..., 2]) < 1e-9, 1e-9, p[..., 2])
         xy = p[..., :2] / z[..., None]
-        bent, by_xy, by_k = bend(xy, coefficients)
+        bent, by_xy = bend(xy, coefficients)
         f = np.diag(K)[:2]
         flat = np.zeros((*z.shape, 2, 3))
         flat[..., 0, 0] = flat[..., 1, 1] = 1 / z
@@ -197,7 +197,7 @@ class _Problem:
             at = names.index(f"fx{k}")
             shared[..., 0, at], shared[..., 1, at + 1] = bent[..., 0], bent[..., 1]
             shared[..., 0, at + 2] = shared[..., 1, at + 3] = 1
-            shared[..., at + 4 : at + 4 + len(coefficients)] = f[:, None] * by_k[..., : len(coefficients)]
+            shared[..., at + 4 : at + 4 + len(coefficients)] = f[:, None] * by_coefficients(xy, coefficients)
         by_turn = -cross_matrix(turned)
         by_first = by_p
         if k:

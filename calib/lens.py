@@ -21,53 +21,68 @@ COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 LENSES = (0, 1, 4, 5, 8)  # how many coefficients a fit may free
 
 
-def bend(xy: Floats, coefficients: Floats) -> tuple[Floats, Floats, Floats]:
-    """What the lens does to directions, with derivatives.
+def bend(xy: Floats, coefficients: Floats) -> tuple[Floats, Floats]:
+    """What the lens does to directions, with the derivative.
 
     Args:
         xy: float64[...,2] at z = 1.
         coefficients: float64[n], n of `LENSES`.
 
     Returns:
-        (bent float64[...,2], d bent / d xy float64[...,2,2], d bent / d coefficients float64[...,2,8]).
+        (bent float64[...,2], d bent / d xy float64[...,2,2]).
 
     Source:
         OpenCV's calib3d page, "camera calibration and 3D reconstruction".
     """
-    k = np.zeros(8)
-    k[: len(coefficients)] = coefficients
-    k1, k2, p1, p2, k3, k4, k5, k6 = k
+    k1, k2, p1, p2, k3, k4, k5, k6 = _eight(coefficients)
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
-    top, bottom = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    radial = top / bottom
+    bottom = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / bottom
     slope = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / bottom  # d radial / d r2
-    bent = np.stack([x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-                     y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], -1)  # fmt: skip
-    cross = 2 * x * y * slope + 2 * (p1 * x + p2 * y)
-    by_xy = np.stack([
-        np.stack([radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x, cross], -1),
-        np.stack([cross, radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x], -1),
-    ], -2)  # fmt: skip
-    powers = np.stack([r2, r2**2, r2**3], -1) / bottom[..., None]
-    down = -powers * radial[..., None]
-    rows = []
-    for at, tangential in ((x, (2 * x * y, r2 + 2 * x * x)), (y, (r2 + 2 * y * y, 2 * x * y))):
-        a = at[..., None]
-        rows.append(np.concatenate([powers[..., :2] * a, np.stack(tangential, -1), powers[..., 2:] * a, down * a], -1))
-    return bent, by_xy, np.stack(rows, -2)
+    across = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    down = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    by = np.empty((*xy.shape, 2))
+    by[..., 0, 0] = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+    by[..., 0, 1] = by[..., 1, 0] = 2 * x * y * slope + 2 * (p1 * x + p2 * y)
+    by[..., 1, 1] = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+    return np.stack([across, down], -1), by
+
+
+def by_coefficients(xy: Floats, coefficients: Floats) -> Floats:
+    """d bent / d coefficients of `bend`, float64[...,2,n]."""
+    _, _, _, _, _, k4, k5, k6 = _eight(coefficients)
+    x, y = xy[..., 0, None], xy[..., 1, None]
+    r2 = x * x + y * y
+    bottom = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = _radial(r2, coefficients)
+    powers = np.concatenate([r2, r2**2, r2**3], -1) / bottom
+    across = [powers[..., :2] * x, 2 * x * y, r2 + 2 * x * x, powers[..., 2:] * x, -powers * radial * x]
+    down = [powers[..., :2] * y, r2 + 2 * y * y, 2 * x * y, powers[..., 2:] * y, -powers * radial * y]
+    rows = [np.concatenate(row, -1) for row in (across, down)]
+    return np.stack(rows, -2)[..., : len(coefficients)]
 
 
 def bent_only(xy: Floats, coefficients: Floats) -> Floats:
     """What `bend` does to directions, without the derivatives: a quarter of its cost."""
     if not len(coefficients):
         return xy
-    k1, k2, p1, p2, k3, k4, k5, k6 = np.concatenate([coefficients, np.zeros(8 - len(coefficients))])
+    _, _, p1, p2, *_ = _eight(coefficients)
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
-    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    radial = _radial(r2, coefficients)
     across = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     return np.stack([across, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], -1)
+
+
+def _eight(coefficients: Floats) -> Floats:
+    return np.concatenate([coefficients, np.zeros(8 - len(coefficients))])
+
+
+def _radial(r2: Floats, coefficients: Floats) -> Floats:
+    k1, k2, _, _, k3, k4, k5, k6 = _eight(coefficients)
+    top = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return top / (1 + r2 * (k4 + r2 * (k5 + r2 * k6))) if len(coefficients) > 5 else top
 
 
 def project(camera: Camera, points: ArrayLike) -> Floats:
@@ -108,7 +123,7 @@ def directions(camera: Camera, px: ArrayLike) -> Floats:
         for _ in range(30):
             far = np.hypot(xy[..., 0], xy[..., 1])[..., None]
             xy = np.where(far > most * 0.999, xy * (most * 0.999 / np.maximum(far, 1e-300)), xy)
-            bent, by_xy, _ = bend(xy, camera.distortion)
+            bent, by_xy = bend(xy, camera.distortion)
             off = bent - target
             if np.nanmax(np.abs(off), initial=0) < 1e-13:
                 break
@@ -131,7 +146,7 @@ def reach(coefficients: Floats) -> float:
     if not np.any(coefficients):
         return float("inf")
     r = np.linspace(0, 20, 4001)[1:]
-    _, by_xy, _ = bend(
+    _, by_xy = bend(
         np.stack([r, np.zeros_like(r)], -1), np.where(np.arange(len(coefficients)) // 2 == 1, 0, coefficients)
     )
     folded = np.flatnonzero(~(by_xy[:, 0, 0] > 0) | ~(by_xy[:, 1, 1] > 0))

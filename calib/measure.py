@@ -18,6 +18,8 @@ from spikerig.calib.shots import Pair, Reading, content_hash, read_light
 from spikerig.calib.verdict import Seen, Verdict, coverage, judge_fit, judge_views, pair_rms_px, tilt_deg
 from spikerig.dataset.errors import DataError, NumericsError, RigError
 
+PROBES = 4  # pictures of an arm in which any checkerboard is sought: two, and two in which the one given is not seen
+PROBES = 4  # pictures of an arm in which any checkerboard is sought: two, and others in which the one given is not seen
 ModelHint = Literal["auto", "common", "stereo"]
 
 
@@ -48,7 +50,7 @@ def look(
     hashes: list[tuple[str, str]] = []
     shapes: tuple[set[tuple[int, int]], set[tuple[int, int]]] = (set(), set())
     sizes: list[tuple[int, int]] = []
-    broken: list[str] = []
+    probes, broken = [0, 0], list[str]()
     for pair in pairs:
         names = []
         for arm, (path, reading) in enumerate(((pair.spike, spike), (pair.rgb, rgb))):
@@ -57,8 +59,10 @@ def look(
             except RigError as error:
                 broken.append(f"{path}: {error.what}" + ("" if error.value is None else f" ({error.value})"))
                 continue
-            here = find(light, board)
-            if here is None and not board.charuco and len(sizes) < 6:
+            hopeless = len(sizes) >= PROBES and not any(f is not None for arm_found in found for f in arm_found)
+            here = None if hopeless else find(light, board)  # another board: every further search would be in vain
+            if not board.charuco and probes[arm] < PROBES and (here is None or len(found[arm]) < PROBES // 2):
+                probes[arm] += 1
                 size = seen_size(light)
                 sizes += [size] if size else []
             found[arm].append(here)

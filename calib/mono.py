@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,15 +82,8 @@ def fit_lens(board: Floats, sight: Sight, lenses: Sequence[int] = LENSES) -> Mon
     use = sight.seen.sum(1) >= 4
     if not use.any():
         raise NumericsError("no view shows the board", value=0)
-    odd = np.zeros_like(use)
-    for _ in range(3):
-        fits = _fits(board, sight, use, lenses)
-        off = fits[max(fits)].view_rms_px(0)
-        limit = max(ODD * float(np.nanmedian(off)), FINE * float(np.hypot(sight.width, sight.height)))
-        wrong = use & (np.nan_to_num(off) > limit)
-        if not wrong.any():
-            break
-        use, odd = use & ~wrong, odd | wrong
+    fits, odd = _without_odd(board, sight, use, lenses)
+    use = use & ~odd
     sight = replace(sight, seen=sight.seen & use[:, None])
     covering = [n for n in fits if _covers(fits[n].camera(0, sight))] or [min(fits)]
     best = max((n for n in covering if n <= USUAL), default=min(covering))
@@ -101,6 +95,21 @@ def fit_lens(board: Floats, sight: Sight, lenses: Sequence[int] = LENSES) -> Mon
             best = n if foretold[n] < foretold[best] * (1 - WORTH) else best
     sigma = float(np.sqrt(fits[best].chi2 / fits[best].dof))
     return Mono(fits[best], replace(sight, sigma_px=max(sigma, 1e-4)), foretold, odd)
+
+
+def _without_odd(
+    board: Floats, sight: Sight, use: NDArray[np.bool_], lenses: Sequence[int]
+) -> tuple[dict[int, Fit], NDArray[np.bool_]]:
+    """The fits, and which views were left out of them because their corners fit no lens that fits the others."""
+    odd = np.zeros_like(use)
+    while True:
+        fits = _fits(board, sight, use & ~odd, lenses)
+        off = fits[max(fits)].view_rms_px(0)
+        limit = max(ODD * float(np.nanmedian(off)), FINE * float(np.hypot(sight.width, sight.height)))
+        wrong = use & ~odd & (np.nan_to_num(off) > limit)
+        if not wrong.any():
+            return fits, odd
+        odd |= wrong
 
 
 def _fits(board: Floats, sight: Sight, use: NDArray[np.bool_], lenses: Sequence[int]) -> dict[int, Fit]:
@@ -161,6 +170,6 @@ def _start(board: Floats, sight: Sight, use: NDArray[np.bool_]) -> Guess:
     return Guess(((our_matrix(np.asarray(K, np.float64)), np.zeros(0)),), poses)
 
 
-def _plausible(K: Floats, sight: Sight) -> bool:
+def _plausible(K: NDArray[Any], sight: Sight) -> bool:
     f, middle = K[0, 0] / sight.width, K[:2, 2] / (sight.width, sight.height)
     return bool(np.isfinite(K).all() and 3 * SHORTEST < f < LONGEST / 10 and np.all((middle > 0) & (middle < 1)))

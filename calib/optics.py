@@ -273,10 +273,30 @@ def _told(
     worst = float(np.nanmax(crop_sd)) if np.isfinite(crop_sd).any() else float("inf")
     sd["baseline_mm"] = float(np.sqrt(max(unit @ free[-3:, -3:] @ unit, 0)))
     record = replace(record, sd={**{k: v for k, v in sd.items() if np.isfinite(v)}, "crop_px": min(worst, 1e6)})
+    jackknife = dict(zip(names, scatter.tolist(), strict=True))
     return RigFit(
-        record, match.first, match.second, match, others[0] if others else None, fit, held, chance, parallax, bound,
-        left_out, names, sd, dict(zip(names, scatter.tolist(), strict=True)), crop_sd, moved,
+        _rounded(record), match.first, match.second, match, others[0] if others else None, fit, held, chance, parallax,
+        bound, left_out, names, sd, jackknife, crop_sd, moved,
     )  # fmt: skip
+
+
+def _rounded(record: RigCalibration) -> RigCalibration:
+    """The record without the last digits, which differ from run to run (sums take the order that memory suggests)."""
+
+    def camera(c: Camera) -> Camera:
+        return replace(c, K=c.K.round(6), distortion=c.distortion.round(9))
+
+    M = record.spike_from_rgb.cam_from_world
+    step = np.concatenate([M[:, :3].round(9), M[:, 3:].round(5)], 1) + 0.0  # no negative zeros
+    return replace(
+        record,
+        spike=camera(record.spike),
+        rgb=camera(record.rgb),
+        spike_from_rgb=Pose(step),
+        depth_mm=(round(record.depth_mm[0], 3), round(record.depth_mm[1], 3)),
+        residual_px=round(record.residual_px, 6),
+        sd={name: float(f"{value:.3g}") for name, value in record.sd.items()},
+    )
 
 
 def _free(fit: Fit, match: Match, held: bool, names: tuple[str, ...]) -> Floats:

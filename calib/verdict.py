@@ -49,7 +49,7 @@ class Seen:
         names: of the views.
         spike, rgb: corners found.
         hashes: per view (spike, rgb) content of the pictures.
-        sizes: board sizes (cols, rows) that were seen instead where the board asked for was not.
+        sizes: sizes (cols, rows) of whatever boards were seen in some of the pictures.
     """
 
     names: Sequence[str]
@@ -102,7 +102,8 @@ def judge_views(board: Board, seen: Seen, verdict: Verdict) -> NDArray[np.bool_]
             )
     pairs = int((saw[0] & saw[1] & (same < 0)).sum())
     other = {(max(s), min(s)) for s in seen.sizes if set(s) != {board.cols, board.rows}}
-    if other and 2 * pairs < len(seen.names):
+    none_right = len(seen.sizes) > 1 and all(set(s) != {board.cols, board.rows} for s in seen.sizes)
+    if other and (none_right or 2 * pairs < len(seen.names)):  # a part of a larger board may well be found
         sizes = " or ".join(f"{c}x{r}" for c, r in sorted(other))
         verdict.refuse(
             "wrong-pattern",

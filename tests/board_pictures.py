@@ -1,6 +1,7 @@
 """Exact pictures of a checkerboard, by casting rays through a known lens; and what a spike sensor makes of them."""
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
@@ -36,8 +37,11 @@ class Lens:
         i, j = np.meshgrid(np.arange(s), np.arange(s))
         px = np.stack([(i + (j + 0.5) / s) / s, (j + (i + 0.5) / s) / s], -1).reshape(-1, 2)  # within a pixel
         x, y = np.meshgrid(np.arange(cam.width), np.arange(cam.height))
-        here = np.stack([x, y], -1)[None] + px[:, None, None]
-        self.rays = directions(cam, here)[..., :2].astype(np.float32)
+        here = np.stack([x, y], -1) + 0.5
+        middle = directions(cam, here)[..., :2]
+        by = [(directions(cam, here + h) - directions(cam, here - h))[..., :2] for h in ([0.5, 0], [0, 0.5])]
+        # within a pixel a lens is straight to 1e-4 px
+        self.rays = np.stack([middle + by[0] * (a - 0.5) + by[1] * (b - 0.5) for a, b in px]).astype(np.float32)
 
     def picture(self, pose: np.ndarray, black: float = 0.05, white: float = 0.8, behind: float = 0.3,
                 cols: int = COLS, rows: int = ROWS, square: float = SQUARE) -> np.ndarray:  # fmt: skip
@@ -55,6 +59,14 @@ class Lens:
     def corners(self, pose: np.ndarray, **board: float) -> np.ndarray:
         """Where the corners truly are, float64[N,2]."""
         return project(self.camera, corners(**board) @ pose[:, :3].T + pose[:, 3])
+
+
+@lru_cache
+def lens(arm: str, samples: int, **rig_of: object) -> Lens:
+    """The camera of an arm of `calib_rigs.rig(**rig_of)`, its rays cast once a session."""
+    from calib_rigs import rig
+
+    return Lens(rig(**rig_of).camera(arm), samples)  # type: ignore[arg-type]
 
 
 def poses(count: int, seed: int = 0, tilt_deg: float = 40, near: float = 330, far: float = 620) -> np.ndarray:

@@ -35,6 +35,10 @@ def test_a_rig_is_found_whatever_its_mirror_and_labels(mirrored: str | None, shi
     assert found.rgb.K[0, 2] == pytest.approx(true.rgb.K[0, 2], abs=5 * fit.sd["rgb.cx_px"])
 
 
+def test_the_same_corners_give_the_same_record() -> None:
+    assert len({fit_rig(BOARD, *corners_seen(rig(), 5), lenses=(4,)).calibration.id for _ in range(5)}) == 1
+
+
 def test_the_user_may_say_that_the_spike_arm_is_the_mirrored_one() -> None:
     true = rig((0, 0, 0), "spike")
     sights = corners_seen(true, VIEWS, shuffle=True)
@@ -161,6 +165,8 @@ def test_all_faults_of_the_views_at_once() -> None:
     assert told == ["duplicates", "too-few-views"]
     blind = Sight(sights[0].px, np.zeros_like(sights[0].seen), 400, 250)
     assert codes((blind, sights[1]), sizes=[(7, 4), (4, 7)]) == ["wrong-pattern", "too-few-views"]
+    part = codes(corners_seen(rig(), 6), sizes=[(11, 8), (8, 11)])  # a part of a larger board fits, and is not believed
+    assert part == ["wrong-pattern"]
 
 
 def test_a_board_that_has_not_moved_is_one_view() -> None:
