@@ -39,7 +39,7 @@ class Board:
         """float64[N,3] corners in mm about the board's middle, row by row, z = 0."""
         x, y = np.meshgrid(np.arange(self.cols), np.arange(self.rows))
         flat = np.stack([x.ravel() - (self.cols - 1) / 2, y.ravel() - (self.rows - 1) / 2, np.zeros(x.size)], -1)
-        return flat * self.square_mm
+        return np.asarray(flat, np.float64) * self.square_mm
 
     @property
     def turns(self) -> tuple[int, ...]:
