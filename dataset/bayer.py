@@ -121,18 +121,18 @@ def demosaic(texture: Texture, bayer: Bayer) -> ColourTexture:
         About 35 ns a pixel and colour.
     """
     apart = split(texture, bayer)
-    weight = _blur(apart.known.astype(np.float32))
-    total = _blur(apart.light)
-    around = np.divide(total, weight, out=np.zeros_like(total), where=weight > 0)
+    number = _around(apart.known.astype(np.float32))
+    total = _around(apart.light)
+    around = np.divide(total, number, out=np.zeros_like(total), where=number > 0)  # all of them are equally far
     light = np.where(apart.known, apart.light, around)
-    return ColourTexture(light, weight > 0, texture.at, f"{texture.method}, bilinear")
+    return ColourTexture(light, number > 0, texture.at, f"{texture.method}, bilinear")
 
 
-def _blur(planes: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Sum over 3 x 3 pixels with weights 1 2 1 along both axes, [H,W,3]; nothing beyond the border."""
+def _around(planes: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Sum over 3 x 3 pixels, [H,W,3]; nothing beyond the border."""
     for axis in (0, 1):
         wide = np.pad(planes, [(1, 1) if a == axis else (0, 0) for a in range(3)])
         n = planes.shape[axis]
         at = [[slice(k, k + n) if a == axis else slice(None) for a in range(3)] for k in range(3)]
-        planes = wide[tuple(at[0])] + 2 * wide[tuple(at[1])] + wide[tuple(at[2])]
+        planes = wide[tuple(at[0])] + wide[tuple(at[1])] + wide[tuple(at[2])]
     return planes

@@ -6,6 +6,8 @@ truncated file "successfully" with a part missing.
 
 from __future__ import annotations
 
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,8 +17,9 @@ from numpy.typing import NDArray
 from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.primaries import REC709, rec709_from, rgb_from_luma_chroma
 
-MAX_PIXELS = 1 << 28
-MAX_BYTES = 1 << 32
+MAX_PIXELS = 1 << 27
+MAX_BYTES = 1 << 31
+MAX_RATIO = 1 << 12  # of pixels in memory to bytes in the file: more is no picture but a claim
 DEEP = ("deepscanline", "deeptile")
 DEPTHS = ("Z", "Y", "V", "depth", "Depth")  # names under which renderers write depth
 FAR = {np.dtype(np.float16): 65504.0, np.dtype(np.float32): 1e9}  # "nothing there", as Blender and others write it
@@ -78,7 +81,8 @@ def read_exr(path: Path, layer: str = "") -> Pixels:
     parts = _read_parts(path)
     found = _pick(path, [chosen for part in parts for chosen in _layers(part)], layer)
     channels, header = found.channels, found.part.header
-    primaries = tuple(float(v) for v in header.get("chromaticities", REC709))
+    primaries = _numbers(path, header, "chromaticities", 8) or REC709
+    neutral = _numbers(path, header, "adoptedNeutral", 2)
     alpha = [np.asarray(channels["A"], np.float32)] if found.kind.endswith("A") else []
     if found.kind.startswith("YC"):
         rgb = rgb_from_luma_chroma(channels["Y"], channels["RY"], channels["BY"], primaries)
@@ -87,8 +91,8 @@ def read_exr(path: Path, layer: str = "") -> Pixels:
     else:
         gray = np.asarray(channels["Y"], np.float32)[:, :, None]
         rgb = gray if not alpha else np.repeat(gray, 3, 2)
-    if rgb.shape[2] == 3 and (np.abs(np.subtract(primaries, REC709)).max() > 1e-4 or "adoptedNeutral" in header):
-        rgb = rgb @ rec709_from(primaries, header.get("adoptedNeutral")).T.astype(np.float32)
+    if rgb.shape[2] == 3 and (np.abs(np.subtract(primaries, REC709)).max() > 1e-4 or neutral):
+        rgb = rgb @ rec709_from(primaries, neutral).T.astype(np.float32)
     return _on_display(path, header, np.dstack([rgb, *alpha]))
 
 
@@ -161,7 +165,7 @@ def _heads(path: Path) -> list[dict[str, Any]]:
     import OpenEXR
 
     try:
-        with OpenEXR.File(str(path), header_only=True) as file:
+        with redirect_stdout(StringIO()), OpenEXR.File(str(path), header_only=True) as file:
             heads = [dict(part.header) for part in file.parts]  # emptied on leaving the `with`
         claimed = 0
         for head in heads:
@@ -169,14 +173,18 @@ def _heads(path: Path) -> list[dict[str, Any]]:
                 height, width = window_shape(head, window)
                 check_size(path, width, height)
             height, width = window_shape(head, "dataWindow")
-            claimed += 4 * height * width * len(head["channels"])
+            if tiles := head.get("tiles"):  # they are allocated whole, however small the picture is
+                check_size(path, tiles.xSize, tiles.ySize)
+                height, width = max(height, tiles.ySize), max(width, tiles.xSize)
+            claimed += (128 if _type(head) in DEEP else 4) * height * width * len(head["channels"])
+        most = min(MAX_BYTES, (1 << 24) + MAX_RATIO * path.stat().st_size)
     except DataError:
         raise
     except Exception as error:  # the binding raises RuntimeError, ValueError, TypeError, as it comes
         raise damaged(path, str(error)) from error
     if not heads:
         raise damaged(path, "it has no parts")
-    if claimed > MAX_BYTES:
+    if claimed > most:
         raise DataError("the picture's claimed size is refused", value=f"{path}: {claimed} bytes in {len(heads)} parts")
     return heads
 
@@ -190,16 +198,31 @@ def _read_parts(path: Path) -> list[Part]:
             "deep pixels are no picture", value=path, cause="each pixel holds samples at many depths",
             next="flatten it first, e.g. with oiiotool --flatten",
         )  # fmt: skip
+    said = StringIO()  # the binding prints on stdout what it could not read, and goes on
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with redirect_stdout(said), OpenEXR.File(str(path), separate_channels=True) as file:
             parts = [
                 Part(dict(p.header), {name: np.array(c.pixels) for name, c in p.channels.items()}) for p in file.parts
             ]
     except Exception as error:
         raise damaged(path, str(error)) from error
-    if len(parts) != len(heads):  # a part whose pixels fail is dropped with a word on stderr
-        raise damaged(path, f"{len(heads) - len(parts)} of {len(heads)} parts cannot be read: truncated?")
+    if len(parts) != len(heads):
+        lost = f"{len(heads) - len(parts)} of {len(heads)} parts cannot be read: truncated?"
+        raise damaged(path, f"{lost} ({' '.join(said.getvalue().split())[:200]})")
     return [part for part in parts if _type(part.header) not in DEEP]
+
+
+def _numbers(path: Path, header: dict[str, Any], name: str, count: int) -> tuple[float, ...] | None:
+    """An attribute of so many numbers; None where the file has none."""
+    if name not in header:
+        return None
+    try:
+        values = tuple(float(v) for v in np.ravel(header[name]))
+    except (TypeError, ValueError):  # an attribute of another type
+        values = ()
+    if len(values) != count:
+        raise damaged(path, f"its {name} is not {count} numbers")
+    return values
 
 
 def _type(header: dict[str, Any]) -> str:

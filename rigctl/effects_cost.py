@@ -62,18 +62,14 @@ def effects(
 def found(told: dict[str, Any]) -> list[dict[str, Any]]:
     """Each promise, whether it was kept, and the figures."""
     autos = [(scene["scene"], row) for scene in told["scenes"] for row in scene["auto"]]
-    worst = {
-        key: min(autos, key=lambda pair, key=key: pair[1][f"within_{key}"], default=None) for key in ("spikes", "dn")
-    }
     rows = []
     for key, words in (("spikes", "spike counts"), ("dn", "RGB values")):
-        name, row = worst[key]
-        share = row[f"within_{key}"]
+        share, name, at = min((row[f"within_{key}"], name, row["tolerance"]) for name, row in autos)
         rows.append(
             _row(
                 share >= WITHIN,
                 f"auto within the tolerance of all effects in at least {100 * share:.2f} % of {words} (worst: {name} "
-                f"at {row['tolerance']:g}); {len(told['scenes'])} scenes x {len(autos) // len(told['scenes'])} "
+                f"at {at:g}); {len(told['scenes'])} scenes x {len(autos) // len(told['scenes'])} "
                 "tolerances",
             )
         )

@@ -1,5 +1,6 @@
 """Hard inputs of the effects of light, optics and the RGB camera, and the small lights that they are tried on."""
 
+import cv2
 import numpy as np
 
 from spikerig.dataset.scene import Camera
@@ -24,6 +25,17 @@ def drifting(height: int = 20, width: int = 27, seed: int = 0) -> Light:
 def still(picture: np.ndarray, ticks: int = 400) -> Light:
     """A picture [H,W,3] that stands still over an exposure without margins."""
     return Light(np.asarray(picture, np.float32)[None], np.array([0, ticks]), (0, ticks), 40_000.0)
+
+
+def textured(height: int = 96, width: int = 128, seed: int = 3) -> np.ndarray:
+    """A picture with detail of all sizes, linear, 0.05 to 0.9."""
+    rng = np.random.default_rng(seed)
+    total = sum(
+        cv2.resize(rng.random((height // s + 2, width // s + 2, 3)), (width, height), interpolation=cv2.INTER_CUBIC)
+        for s in (2, 5, 13, 40)
+    )
+    low, high = total.min(), total.max()
+    return (0.05 + 0.85 * (total - low) / (high - low)).astype(np.float32)
 
 
 def run(light: Light, *effects: Effect, seed: int = 1, view: int = 0) -> Simulated:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.scene import Camera
-from spikerig.rigctl.sim.effects import Effect
+from spikerig.rigctl.sim.effects import Effect, Stage
 from spikerig.rigctl.sim.plan import Plan
 from spikerig.rigctl.sim.schedule import Schedule, Track, track_phases
 from spikerig.rigctl.sim.sensor import Light
@@ -62,7 +62,7 @@ class Costs:
     """Predicted CPU seconds of a whole capture.
 
     Args:
-        parts: of what every capture does: name -> seconds.
+        parts: of what every capture does, and what effects cost beyond each alone (it may be less): name -> seconds.
         effects: of each effect, on or off: name -> seconds it takes, or would.
         total: of the parts and the effects that are on.
         spent: what the prediction took.
@@ -100,7 +100,8 @@ def predict(work: Work, made: Plan) -> Costs:
     light = lights[len(lights) // 2]
     parts = {"start": work.once_s, "light": work.train * work.train_s + work.test * work.test_s}
     parts |= _every_view(work, light)
-    effects = _effects(work, light, [row.effect for row in made.rows], {e.name for e in made.effects})
+    effects, more = _effects(work, light, [row.effect for row in made.rows], {e.name for e in made.effects})
+    parts["effects together"] = more
     total = sum(parts.values()) + sum(effects[e.name] for e in made.effects)
     return Costs(parts, effects, total, time.process_time() - began)
 
@@ -173,33 +174,30 @@ def shelved(taken: Taken) -> Taken:
     return loads(dumps(taken), taken.view.name)
 
 
-def _effects(work: Work, light: Light, effects: Sequence[Effect], on: set[str]) -> dict[str, float]:
-    """Seconds that each effect adds: alone, but what sees every tick on top of such as are on."""
+def _effects(work: Work, light: Light, effects: Sequence[Effect], on: set[str]) -> tuple[dict[str, float], float]:
+    """Seconds that each effect adds by itself; and what those that are on add by acting on one another's work."""
     rig, times = work.rig, work.times
     coarse, few = _coarse(rig, times)
     span = int(times.knots[-1] - times.knots[0]) / int(few.knots[-1] - few.knots[0])
+    fine = _block(rig, times, light, SMALL)
     blocks = {
-        "knot": (_block(rig, times, light, SMALL), 1.0),
+        "knot": (fine, 1.0),
         "frame": (_block(coarse, few, light, WIDE), 1.0),
         "tick": (_block(coarse, few, light, SMALL), span),
     }
-    bare: dict[str, float] = {}
-    kept: list[Effect] = []  # that see every tick and are on
+    bare = {per: least(block.take) for per, (block, _) in blocks.items()}
     found: dict[str, float] = {}
-    for effect in sorted(effects, key=lambda e: e.name not in on):
+    for effect in effects:
         block, scale = blocks[effect.per]
-        if effect.per not in bare:
-            bare[effect.per] = least(block.take)
-        below = kept if effect.per == "tick" else []
         apart = effect.name == "misalignment" and work.arm_s > 0
-        seconds = least(lambda b=block, e=(*below, effect), apart=apart: b.take(*e, apart=apart))
-        found[effect.name] = work.train * max(seconds - bare[effect.per], 0.0) * scale / block.share
-        if apart:
-            found[effect.name] += work.train * work.arm_s
-        if effect.per == "tick" and effect.name in on:
-            kept.append(effect)
-            bare["tick"] = seconds
-    return found
+        seconds = least(lambda b=block, e=effect, apart=apart: b.take(e, apart=apart)) - bare[effect.per]
+        found[effect.name] = work.train * (max(seconds, 0.0) * scale / block.share + apart * work.arm_s)
+    # A picture's coding is told well enough by itself; optics may act on every sample where rows roll.
+    both = [e for e in effects if e.name in on and (e.per != "frame" or e.stage == Stage.OPTICS)]
+    apart = any(e.name == "misalignment" for e in both) and work.arm_s > 0
+    joint = work.train * (least(lambda: fine.take(*both, apart=apart), 2) - bare["knot"]) / fine.share
+    alone = sum(found[e.name] for e in both) - apart * work.train * work.arm_s
+    return found, joint - alone
 
 
 def _coarse(rig: Rig, times: Schedule) -> tuple[Rig, Schedule]:

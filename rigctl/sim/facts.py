@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.floating]
 PART = 95.0  # a bound holds for this share of the pixels, percent
 SLACK = 1.25  # bounds take changes of charge this much larger than computed: a survey is a sample
+RARE = 1 - PART / 100
+SURE = 3.0  # standard deviations of a share of one picture's pixels
 DRAWS = 8192  # of a noise, at least, where a bound needs its distribution
 
 
@@ -39,6 +41,14 @@ class Bound:
     spikes: float
     dn: float
     formula: str
+
+
+def told(difference: Floats) -> float:
+    """A change that happened, told as `Bound` tells bounds: what 95 % of the values stay within; where 95 % do not
+    change at all, the share that does, over 5 %."""
+    size = np.abs(np.asarray(difference, np.float64))
+    moved = float(np.mean(size > 0)) if size.size else 0.0
+    return moved / RARE if moved <= RARE else float(np.percentile(size, PART, method="inverted_cdf"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,13 +139,15 @@ class Facts:
         moved = np.clip(after, 0, 1) - np.clip(before, 0, 1)
         return self.counted(moved * self.ticks, moved * self.margin_ticks, share)
 
-    def counted(self, change: Floats, before: Floats | float = 0.0, share: float = 1.0) -> float:
+    def counted(self, change: Floats, before: Floats | float = 0.0, share: float = 1.0, together: float = 1.0) -> float:
         """Change of the spike count that 95 % of the pixels stay within, as `Bound.spikes` says.
 
         Args:
             change: of the charge over the exposure, thresholds [..,n].
             before: of the charge until the exposure begins, thresholds [..,n].
             share: of the pixels (or views) that change at all.
+            together: pixels that change at once, as a row does: shares of a picture scatter the more for it, and the
+                bound takes three standard deviations of that.
 
         Edges:
             The count is floor(phase + charge) at the end less the same at the start, both phases even and independent:
@@ -156,10 +168,10 @@ class Facts:
         ):
             found = np.bincount(np.abs(whole + step), chance)
             tally[: len(found)] += found
-        beyond = share * (1 - np.cumsum(tally) / start.size)
-        rare = 1 - PART / 100
-        least = int(np.argmax(beyond <= rare))  # the last is 0 but for rounding
-        return float(least) if least else max(float(beyond[0]), 0.0) / rare
+        beyond = share * np.maximum(1 - np.cumsum(tally) / start.size, 0)
+        beyond += SURE * np.sqrt(beyond * (together / max(self.size[0] * self.size[1], 1)))
+        least = int(np.argmax(beyond <= RARE))  # the last is 0 but for rounding
+        return float(least) if least else float(beyond[0]) / RARE
 
     def normal(self, kinds: int = 1) -> Floats:
         """Fixed draws of independent unit normals to compute with, float64[kinds,m,n], m * n at least `DRAWS`."""

@@ -69,8 +69,8 @@ def read_folder(
 
     Args:
         folder: with transforms.json.
-        settings: a TOML file with any of name, seed and the tables exposure, sensor, effects and points of a scene
-            file; None takes capture.toml of the folder, and defaults where that is missing.
+        settings: a TOML file with any of name, seed and the tables exposure, sensor, effects, events and points of a
+            scene file; None takes capture.toml of the folder, and defaults where that is missing.
         protocol, seed: in place of the settings'.
         bad_values: what becomes of NaN, infinite and negative values: refuse, zero or clip (see `pictures.mend`).
 

@@ -73,7 +73,8 @@ def look_folder(folder: Folder, views: int = VIEWS) -> Looked:
     near = (float(far.min()), float(np.median(far))) if far.size else (np.inf, np.inf)
     facts = survey(looks, rig.sensor, rig.exposure, focal_px=float(camera.K[0, 0]), views=len(train), depth=near)
     lights = [each.light for each in looks]
-    return Looked(facts, samples_left(lights, exposures, motions, rig.sensor, chosen=False), tuple(lights), camera)
+    samples = samples_left(lights, exposures, motions, rig.sensor, chosen=False)
+    return Looked(facts, samples, tuple(looks), tuple(train), rig.seed, rig.sensor, rig.exposure, camera)
 
 
 def _inside(view: Sequence) -> NDArray[np.intp]:

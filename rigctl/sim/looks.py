@@ -51,16 +51,33 @@ class Looked:
     """What the looks gave.
 
     Args:
-        facts: for the effects' bounds.
+        facts: of the light as it is, for the effects' bounds.
         samples: of light.
-        lights: over the exposures of the views looked at.
-        camera: the pinhole.
+        looks: the views looked at, over their exposures.
+        train: numbers of all views that are simulated.
+        seed, sensor, exposure, camera: of the scene.
     """
 
     facts: Facts
     samples: Samples
-    lights: tuple[Light, ...]
+    looks: tuple[Look, ...]
+    train: tuple[int, ...]
+    seed: int
+    sensor: Sensor
+    exposure: Exposure
     camera: Camera
+
+    @property
+    def lights(self) -> tuple[Light, ...]:
+        """The light of the views looked at."""
+        return tuple(each.light for each in self.looks)
+
+    def surveyed(self, looks: Sequence[Look]) -> Facts:
+        """Facts of other looks at the same scene."""
+        return survey(
+            looks, self.sensor, self.exposure,
+            focal_px=self.facts.focal_px, views=self.facts.views, depth=self.facts.depth,
+        )  # fmt: skip
 
 
 def spread(numbers: Sequence[int], count: int) -> list[int]:
@@ -96,7 +113,7 @@ def look(spec: SceneSpec, views: int = VIEWS) -> Looked:
     )
     lights = [each.light for each in looks]
     samples = samples_left(lights, exposures, motions, spec.sensor, chosen=not spec.exposure.sub_poses)
-    return Looked(facts, samples, tuple(lights), camera)
+    return Looked(facts, samples, tuple(looks), tuple(train), spec.seed, spec.sensor, spec.exposure, camera)
 
 
 def _view(spec: SceneSpec, number: int, stage: Stage, camera: Camera) -> tuple[Light, NDArray, NDArray]:

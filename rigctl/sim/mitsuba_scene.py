@@ -25,6 +25,7 @@ from spikerig.rigctl.sim.capture import camera_of, view_path
 from spikerig.rigctl.sim.limits import Faults, limits, read_record
 from spikerig.rigctl.sim.schedule import schedule
 from spikerig.rigctl.sim.spec import SceneSpec, read_scene
+from spikerig.rigctl.sim.tomltext import toml_text
 
 VARIANTS = ("scalar_rgb", "scalar_spectral", "llvm_ad_rgb", "llvm_ad_spectral", "cuda_ad_rgb", "cuda_ad_spectral")
 RECORD = "mitsuba.json"
@@ -109,6 +110,8 @@ def plan_scene(
     spec = read_scene({**table, "world": NOWHERE}, str(path))
     faults = Faults(str(path))
     renderer = read_record(Renderer, {**own, **given} if isinstance(own, dict) else own, "mitsuba", faults)
+    if not spec.exposure.sub_poses:
+        faults.add("exposure.sub_poses", "is 0, as many as the motion asks for: of a rendered scene say how many")
     if spec.exposure.light == "hold" and spec.exposure.margin_ticks:
         faults.add("exposure.margin_ticks", "are not for light that holds in a folder of frames: set 0")
     faults.raise_any()
@@ -169,22 +172,7 @@ def capture_toml(table: Mapping[str, Any]) -> str:
     kept = {k: v for k, v in table.items() if k not in ("camera", "orbit", "shake", "mitsuba")}
     if isinstance(kept.get("exposure"), dict):
         kept["exposure"] = {k: v for k, v in kept["exposure"].items() if k not in ("sub_poses", "margin_ticks")}
-    plain = [f"{k} = {_toml(v)}" for k, v in kept.items() if not isinstance(v, dict)]
-    for name, rows in ((k, v) for k, v in kept.items() if isinstance(v, dict)):
-        plain += ["", f"[{name}]", *(f"{_key(k)} = {_toml(v)}" for k, v in rows.items())]
-    return "\n".join(plain) + "\n"
-
-
-def _key(name: str) -> str:
-    return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else json.dumps(name)
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{_key(k)} = {_toml(v)}" for k, v in value.items()) + " }"
-    if isinstance(value, list):
-        return "[" + ", ".join(_toml(v) for v in value) + "]"
-    return json.dumps(value) if isinstance(value, bool | str) else repr(value)
+    return toml_text(kept)
 
 
 def render_folder(

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from spikerig.dataset.images import srgb_from_linear
-from spikerig.rigctl.sim.effects import Effect, Site, Stage, parameters
+from spikerig.rigctl.sim.chain import bounds_of
+from spikerig.rigctl.sim.effects import Effect, parameters
 from spikerig.rigctl.sim.facts import PART, Bound, Facts
 from spikerig.rigctl.sim.looks import Looked, Samples, look
 from spikerig.rigctl.sim.spec import Exposure, SceneSpec, Tolerance
@@ -112,12 +113,11 @@ def judged(looked: Looked, effects: Sequence[Effect], tolerance: Tolerance | Non
         effects: those to choose from, in the order in which they act.
         tolerance: None keeps all.
     """
-    facts = with_dark(looked.facts, effects)
-    bounds = {effect.name: effect.magnitude(facts) for effect in effects}
+    bounds = bounds_of(looked, effects)
     if tolerance is None:
         rows = tuple(Judged(e, True, bounds[e.name], "listed") for e in effects)
         return Plan(rows, None, (0.0, 0.0), (0.0, 0.0), looked.samples, looked)
-    room = room_of(tolerance, facts, any(e.name == "initial_phase" for e in effects))
+    room = room_of(tolerance, looked.facts, any(e.name == "initial_phase" for e in effects))
     left, off, why = np.zeros(2), set[str](), dict[str, str]()
     for name in sorted(bounds, key=lambda name: (_share(bounds[name], tolerance), name)):
         bound = np.array([bounds[name].spikes, bounds[name].dn])
@@ -130,24 +130,6 @@ def judged(looked: Looked, effects: Sequence[Effect], tolerance: Tolerance | Non
             why[name] = _too_much(bound, left, room)
     rows = tuple(Judged(e, e.name not in off, bounds[e.name], why[e.name]) for e in effects)
     return Plan(rows, tolerance, room, (float(left[0]), float(left[1])), looked.samples, looked)
-
-
-def with_dark(facts: Facts, effects: Sequence[Effect]) -> Facts:
-    """Facts with the charge that comes without light: it makes spikes for others to change, even in the dark.
-
-    Args:
-        facts: of the light alone.
-        effects: all there may be, in the order in which they act.
-    """
-    height, width = facts.size
-    site = Site(height, width, 0, 0, facts.rate_hz, 0.0, facts.ticks + 2 * facts.margin_ticks)
-    dark = np.zeros((1, height, width), np.float32)
-    for effect in effects:
-        hooks = effect.begin(site) if effect.stage == Stage.CHARGE else None
-        if hooks is not None and hooks.light is not None:
-            hooks.light(dark)
-    mean = float(dark.mean())
-    return replace(facts, light=facts.light + mean, light_max=facts.light_max + mean) if mean > 0 else facts
 
 
 def _share(bound: Bound, tolerance: Tolerance) -> float:

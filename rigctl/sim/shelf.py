@@ -24,12 +24,15 @@ from zipfile import BadZipFile
 import numpy as np
 
 from spikerig.dataset.errors import DataError, HostError, RigError, UsageError
+from spikerig.dataset.events import EventStream
 from spikerig.dataset.scene import Frame, Points, Pose, Trajectory, View
 from spikerig.dataset.spikes import SpikeStream
 from spikerig.dataset.terminal import jsonable
 from spikerig.rigctl.sim.take import Taken
 
-RECORDS = {record.__name__: record for record in (Taken, View, Frame, SpikeStream, Pose, Trajectory, Points)}
+RECORDS = {
+    record.__name__: record for record in (Taken, View, Frame, SpikeStream, EventStream, Pose, Trajectory, Points)
+}
 SOURCES = ("spikerig.rigctl.sim", "spikerig.dataset")
 
 

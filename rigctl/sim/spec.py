@@ -8,20 +8,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from spikerig.dataset.bayer import PATTERNS, Bayer
 from spikerig.dataset.errors import UsageError
 from spikerig.rigctl.sim.effects import Effect, effect_class, in_order, read_effects, settled
+from spikerig.rigctl.sim.events import EventCamera
 from spikerig.rigctl.sim.limits import Faults, limits, nearest, read_record
 from spikerig.rigctl.sim.orbit import Orbit, orbit_pose
 from spikerig.rigctl.sim.presets import PRESETS, preset_effects, preset_names
 from spikerig.rigctl.sim.world import Vec3, World, read_world, stands_in
-
-if TYPE_CHECKING:
-    from spikerig.rigctl.sim.events import EventCamera
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,15 +276,8 @@ def _settings(top: _Top, faults: Faults) -> Settings:
         if isinstance(top.sensor, Mapping) and name in top.sensor:
             faults.add(f"sensor.{name}", 'is for colour = "bayer"; this sensor sees gray')
     auto = tolerance if top.effects == "auto" else None
-    return Settings(top.name, top.seed, exposure, sensor, cloud, effects, rgb, auto, _event_camera(top.events, faults))
-
-
-def _event_camera(table: Any, faults: Faults) -> EventCamera | None:
-    if table is None:
-        return None
-    from spikerig.rigctl.sim.events import EventCamera
-
-    return read_record(EventCamera, table, "events", faults)
+    events = None if top.events is None else read_record(EventCamera, top.events, "events", faults)
+    return Settings(top.name, top.seed, exposure, sensor, cloud, effects, rgb, auto, events)
 
 
 def _sensor_defaults(table: Any, paper: bool) -> Mapping[str, Any]:
@@ -355,7 +346,11 @@ def _check_views(spec: SceneSpec, faults: Faults) -> None:
         faults.add("exposure.sub_poses", f"is {n}, more than fit the {spec.exposure.ticks} ticks of an exposure")
     if spec.shake.path_px[0] > spec.shake.path_px[1]:
         faults.add("shake.path_px", f"is {list(spec.shake.path_px)}, expected [low, high]")
-    _check_rows(spec, faults)
+    rolling: Any = next((e for e in spec.effects if e.name == "rolling_shutter"), None)
+    if rolling is not None and (
+        trouble := rolling.beyond(spec.lens.height, spec.exposure.margin_ticks, spec.exposure.tick_ns)
+    ):
+        faults.add("exposure.margin_ticks", trouble)
     for k in orbit.test:
         if k != int(k) or k >= orbit.views:
             faults.add("orbit.test", f"holds {k:g}, expected view numbers 0 to {orbit.views - 1}")
@@ -367,21 +362,6 @@ def _check_views(spec: SceneSpec, faults: Faults) -> None:
         if trouble:
             faults.add("orbit", f"view {number} stands {trouble}")
             return
-
-
-def _check_rows(spec: SceneSpec, faults: Faults) -> None:
-    """Rows of a rolling shutter must be exposed within the margins."""
-    rolling: Any = next((e for e in spec.effects if e.name == "rolling_shutter"), None)
-    height, exposure = spec.lens.height, spec.exposure
-    if rolling is None:
-        return
-    needed = rolling.row_ns(height) * (height // 2) / exposure.tick_ns
-    if needed > exposure.margin_ticks:
-        faults.add(
-            "exposure.margin_ticks",
-            f"is {exposure.margin_ticks}, but rolling_shutter exposes the first row {needed:.4g} ticks before "
-            "the middle one: raise it, or lower readout_ms",
-        )
 
 
 def with_changes(spec: SceneSpec, *, seed: int | None = None, views: int | None = None) -> SceneSpec:

@@ -76,15 +76,18 @@ def _facts(look: Look, sensor: Sensor) -> tuple[dict[str, Any], tuple[Floats, Fl
     height, width = mean.shape
     y, x = np.mgrid[:height, :width]
     half = np.hypot(height, width) / 2
+    steep, bent = steepest(mean), bend(mean)
+    if sensor.bayer is not None:  # neighbours differ in colour, which optics do not mix
+        steep, bent = (spike_light(change(rgb)[None], sensor)[0] for change in (steepest, bend))
     rows = {
         "light": mean,
         "light_max": seen.max(0),
-        "gradient": steepest(mean),
+        "gradient": steep,
         "rgb": rgb,
         "rgb_gradient": steepest(rgb),
         "slope": np.abs(seen[-1] - seen[0]),
         "rgb_slope": np.abs(pictures[-1] - pictures[0]),
-        "bend": bend(mean),
+        "bend": bent,
         "rgb_bend": bend(rgb),
         "radius": np.hypot(y + 0.5 - height / 2, x + 0.5 - width / 2) / half,
         "motion": np.broadcast_to(np.asarray(look.motion, np.float64), (height, width)),

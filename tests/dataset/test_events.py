@@ -169,6 +169,20 @@ def test_a_window_of_the_file_is_that_slice(tmp_path: Path) -> None:
     assert verify_scene(tmp_path / "s.h5") == []
 
 
+def test_disorder_between_blocks_is_found(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Events are checked some millions at a time; here, 100."""
+    from spikerig.dataset import store_events
+
+    monkeypatch.setattr(store_events, "BLOCK", 100)
+    with open_scene(scene) as file:
+        file.check_events("v-01.x")
+    with h5py.File(scene, "r+") as raw:
+        times = raw[f"{EVENTS}/t_ns"]
+        times[:100] = np.sort(times[:100] + 15_000_000)  # each block is in order, still
+    with open_scene(scene) as file, pytest.raises(DataError, match="order of their times"):
+        file.check_events("v-01.x")
+
+
 def test_events_that_pack_too_well_are_stored_plain(tmp_path: Path) -> None:
     """A reader must take 70 MB in 0.1 MB for a bomb: the writer does not make one."""
     n = 9_000_000

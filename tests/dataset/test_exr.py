@@ -198,6 +198,57 @@ def test_a_channel_of_fewer_samples_is_no_picture(monkeypatch: pytest.MonkeyPatc
         read_exr(Path("x.exr"))
 
 
+def test_a_damaged_file_says_nothing_on_stdout(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """The binding prints; a JSON document shall be alone there."""
+    path = save(tmp_path / "x.exr", {"RGB": RNG.random((64, 64, 3), np.float32)})
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    with pytest.raises(DataError, match="damaged") as told:
+        read_exr(path)
+    assert capfd.readouterr().out == ""
+    assert "1 of 1 parts cannot be read" in told.value.cause
+    assert "Exception raised reading" in told.value.cause
+
+
+def test_claims_that_no_file_of_that_size_can_hold(tmp_path: Path) -> None:
+    path = save(tmp_path / "x.exr", {"RGB": np.zeros((4, 4, 3), np.float32)})
+    whole = path.read_bytes()
+    claim = np.array([0, 0, 9999, 9999], "<i4").tobytes()
+    path.write_bytes(whole.replace(np.array([0, 0, 3, 3], "<i4").tobytes(), claim))
+    with pytest.raises(DataError, match="claimed size is refused") as told:
+        read_exr(path)
+    assert "1200000000 bytes" in str(told.value)
+
+
+def test_tiles_larger_than_any_picture(tmp_path: Path) -> None:
+    tiles = {"tiles": OpenEXR.TileDescription(), "type": OpenEXR.tiledimage}
+    path = save(tmp_path / "x.exr", dict(zip("RGB", planes(3, 40, 33), strict=True)), **tiles)
+    data = path.read_bytes()
+    at = data.index(b"tiles\0tiledesc\0") + len(b"tiles\0tiledesc\0") + 4
+    path.write_bytes(data[: at + 4] + np.array([1 << 24], "<u4").tobytes() + data[at + 8 :])
+    with pytest.raises(DataError, match="claimed size is refused"):
+        read_exr(path)
+
+
+def test_bytes_that_are_wrong(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Any byte of any header or pixel may be wrong: a picture comes, or one of our errors."""
+    window = (np.array([1, 2], np.int32), np.array([7, 6], np.int32))
+    header = {"chromaticities": (0.7, 0.3, 0.2, 0.8, 0.1, 0.05, 0.31, 0.33), "adoptedNeutral": np.float32([0.3, 0.3])}
+    path = save(tmp_path / "x.exr", {"RGBA": RNG.random((5, 7, 4), np.float32)}, dataWindow=window, **header)
+    data, refused = path.read_bytes(), 0
+    for k in range(400):
+        wrong = bytearray(data)
+        for at in RNG.integers(0, len(data), 1 + k % 4):
+            wrong[at] = RNG.integers(0, 256)
+        path.write_bytes(wrong)
+        try:
+            assert read_exr(path).ndim == 3
+        except DataError:
+            refused += 1
+    assert 50 < refused < 400
+    assert capfd.readouterr().out == ""
+
+
 def test_layers_are_for_exr_only(tmp_path: Path) -> None:
     from spikerig.dataset.images import write_image
 

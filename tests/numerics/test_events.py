@@ -85,19 +85,19 @@ def test_the_oracles_events(hold: bool, tau_ns: float) -> None:
 
 
 @pytest.mark.parametrize("hold", [False, True])
-@pytest.mark.parametrize("refractory_ns", [300, 5000])
+@pytest.mark.parametrize("refractory_ns", [60, 1000])
 def test_the_oracles_events_with_a_refractory_time(hold: bool, refractory_ns: int) -> None:
-    """The oracle's resets end up to a step late, so its references drift: the gap closes with the step."""
-    light, at = case(1, hold=hold)
+    """The oracle resets up to a step late, so its references drift: the gap closes to the nanosecond with the step."""
+    light, at = case(1, hold=hold, span=4000)
     limits = thresholds(light.shape[1:])
     mine = kernels.events(light, at, limits, hold=hold, eps=0.01, refractory_ns=refractory_ns)
     gaps = []
-    for step_ns in (4.0, 0.25):
+    for step_ns in (1.0, 0.1):
         true = oracles.events(light, at, limits, hold=hold, eps=0.01, refractory_ns=refractory_ns, step_ns=step_ns)
         a, b = by_pixel(mine), by_pixel(true)
         assert [c.tolist() for c in a[1:]] == [c.tolist() for c in b[1:]]
         gaps.append(np.abs(a[0] - b[0]).mean())
-    assert gaps[1] < max(0.5, 0.3 * gaps[0]), gaps
+    assert gaps[1] <= min(gaps[0], 1.0), gaps
     assert len(mine[0]) > 30
 
 
@@ -124,9 +124,9 @@ def test_sizes(size: tuple[int, int]) -> None:
 
 
 def test_the_same_bits_everywhere() -> None:
-    light, at = case(5, (33, 97), knots=7, span=10**7, low=-4)
+    light, at = case(5, (33, 37), knots=7, span=10**7, low=-4)
     rng = np.random.default_rng(1)
-    noise = rng.integers(0, 33 * 97, 500), rng.random(500) * 1e7, rng.choice(np.array([-1, 1], np.int8), 500)
+    noise = rng.integers(0, 33 * 37, 500), rng.random(500) * 1e7, rng.choice(np.array([-1, 1], np.int8), 500)
     for how in ({}, {"tau_ns": 2e5}, {"refractory_ns": 10_000}, {"noise": noise, "refractory_ns": 500, "tau_ns": 1e4}):
         found = []
         for isa in _native.isas():
@@ -272,7 +272,7 @@ def test_a_photoreceptor_under_a_jump_is_an_exponential() -> None:
 
 def test_a_photoreceptor_that_turns_within_a_segment() -> None:
     """Its light rises on after the light has turned: the peak is met, then the way down."""
-    light, at = case(9, (3, 5), knots=30, span=3000)
+    light, at = case(9, (3, 5), knots=20, span=2000)
     assert agree(light, at, tau_ns=150.0, step_ns=0.5) > 50
     light = np.array([1, 9, 1, 1], np.float32).reshape(-1, 1, 1)
     assert agree(light, np.array([0.0, 500.0, 1000.0, 9000.0]), tau_ns=400.0, step_ns=0.25) > 10
@@ -303,9 +303,9 @@ def test_noise_resets_and_is_lost_in_reset() -> None:
 
 
 def test_noise_among_the_oracles_events() -> None:
-    light, at = case(10, (3, 4))
+    light, at = case(10, (3, 4), span=6000)
     rng = np.random.default_rng(2)
-    noise = rng.integers(0, 12, 40), rng.random(40) * 2e4, rng.choice(np.array([-1, 1], np.int8), 40)
+    noise = rng.integers(0, 12, 40), rng.random(40) * 6e3, rng.choice(np.array([-1, 1], np.int8), 40)
     limits = thresholds((3, 4))
     mine = kernels.events(light, at, limits, hold=False, eps=0.01, noise=noise)
     true = oracles.events(light, at, limits, hold=False, eps=0.01, noise=noise, step_ns=0.25)

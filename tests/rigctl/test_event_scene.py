@@ -12,14 +12,17 @@ from hard_store import same
 
 from spikerig.dataset.bayer import Bayer, bayer_of, demosaic
 from spikerig.dataset.errors import UsageError
+from spikerig.dataset.images import write_image
 from spikerig.dataset.store import open_scene, verify_scene
 from spikerig.dataset.texture import tfp
 from spikerig.rigctl.sim.capture import capture, rig_of, take_view
 from spikerig.rigctl.sim.effects import Hooks
 from spikerig.rigctl.sim.events import EventCamera, simulate_events
 from spikerig.rigctl.sim.sensor import Light, spike_light
+from spikerig.rigctl.sim.shelf import dumps, loads
 from spikerig.rigctl.sim.simulate import simulate
-from spikerig.rigctl.sim.spec import Sensor, read_scene
+from spikerig.rigctl.sim.spec import Exposure, Sensor, read_scene
+from spikerig.rigctl.sim.survey import Look, survey
 
 
 def smooth_light(seed: int = 0, height: int = 14, width: int = 19) -> Light:
@@ -34,6 +37,7 @@ def test_an_event_camera_changes_nothing_else() -> None:
     assert plain.events is None
     assert beside.events is not None
     same(plain, replace(beside, events=None), "taken")
+    same(beside.events, loads(dumps(beside), "a shelf").events, "events, put on a shelf and back")
 
 
 def test_events_see_the_spikes_light() -> None:
@@ -48,6 +52,15 @@ def test_events_see_the_spikes_light() -> None:
         assert np.abs(seen.events.t_ns - true.t_ns).max() <= 25, "float32 sums of another order"
         assert (seen.events.t0_ns, seen.events.t1_ns) == (777, 777 + 200 * 25_000)
         assert seen.spikes.t0_ns == seen.events.t0_ns
+
+
+def test_noise_is_another_in_each_view() -> None:
+    light, noisy = smooth_light(), EventCamera(noise_hz=1e4)
+    one, two, again = (simulate(light, Sensor(), [], 3, view, events=noisy).events for view in (1, 2, 1))
+    assert one is not None
+    assert two is not None
+    same(one, again)
+    assert one.t_ns.tolist() != two.t_ns.tolist()
 
 
 class Dimmer:
@@ -88,6 +101,26 @@ def test_a_captured_scene_holds_its_events(tmp_path: Path) -> None:
         assert 0 < len(events) < len(file.events("000"))
         assert file.info["events"]["threshold_pos"] == 0.3
         assert file.info["scene_file"]["events"]["noise_hz"] == 2.0
+
+
+def test_pictures_from_elsewhere_have_events_too(tmp_path: Path) -> None:
+    from spikerig.rigctl.sim.folder import read_folder
+    from spikerig.rigctl.sim.frames import capture_folder
+
+    frames = []
+    for k in range(3):
+        write_image(tmp_path / f"{k}.exr", np.full((6, 8, 3), [0.1, 0.8, 0.2][k], np.float32))
+        frames.append({"file": f"{k}.exr", "transform_matrix": np.eye(4).tolist()})
+    (tmp_path / "transforms.json").write_text(
+        json.dumps({"camera_angle_x": 1.0, "views": [{"name": "a", "frames": frames}]})
+    )
+    (tmp_path / "capture.toml").write_text("[exposure]\nexposure_ms = 1\n[events]\nthreshold_pos = 0.5\neps = 1e-9\n")
+    told = capture_folder(read_folder(tmp_path), tmp_path / "s.h5")
+    with open_scene(tmp_path / "s.h5") as file:
+        seen = file.events("a")
+    up = int(np.log(8) / 0.5)  # 4, to a level of 2 above the start; the end lies log 2 above it
+    assert told["events"] == len(seen) == 48 * (up + int((up * 0.5 - np.log(2)) / 0.2))
+    assert (np.diff(seen.t_ns)[seen.polarity[1:] != seen.polarity[:-1]] > 0).all()
 
 
 def test_workers_give_the_same_events(tmp_path: Path) -> None:
@@ -157,6 +190,17 @@ def test_optics_act_before_colours_part() -> None:
     assert counts[::2, 1::2].sum() == counts[1::2].sum() == 0
 
 
+def test_a_survey_of_a_colour_sensor_looks_at_each_colour_apart() -> None:
+    """A steady red picture has no gradient for any of its pixels, though the mosaic is a checkerboard."""
+    rgb = np.zeros((2, 12, 16, 3), np.float32)
+    rgb[..., 0] = 0.5
+    look = Look(Light(rgb, np.array([0, 100]), (0, 100), 40_000.0), 1.0)
+    facts = survey([look], Sensor(colour="bayer"), Exposure(), focal_px=20.0, views=1)
+    assert facts.light.max() == pytest.approx(0.2)
+    assert not facts.gradient.any()
+    assert not facts.bend.any()
+
+
 def test_gray_is_what_it_was() -> None:
     rgb = np.random.default_rng(1).random((2, 5, 6, 3)).astype(np.float32)
     k = np.array([0.299, 0.587, 0.114], np.float32) * np.float32(0.4)
@@ -165,7 +209,7 @@ def test_gray_is_what_it_was() -> None:
 
 
 def test_a_colour_scene_says_so_and_gives_its_colours_back(tmp_path: Path) -> None:
-    table = {"colour": "bayer", "pattern": "gbrg", "channel_gain": [1.5, 1.0, 2.0], "gain": 0.3}
+    table = {"colour": "bayer", "pattern": "gbrg", "channel_gain": [1.5, 1.0, 2.0], "gain": 0.3, "response": [1, 1, 1]}
     spec = small(sensor=table, shake__path_px=[0, 0], effects=[], exposure__exposure_ms=40.0, exposure__period_ms=100.0)
     assert rig_of(spec).light_gain == 0.3
     capture(spec, tmp_path / "s.h5")

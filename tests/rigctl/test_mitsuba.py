@@ -204,6 +204,7 @@ def test_the_documented_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         ("mitsuba = 3\n", "expected a table"),
         ('[mitsuba]\nup = "w"\n', "expected one of x, y, z"),
         ('[exposure]\nlight = "hold"\n', "margin_ticks: are not for light that holds"),
+        ("[exposure]\nsub_poses = 0\n", "say how many"),
         ("[orbit]\nradus = 3\n", "did you mean 'radius'"),
         ("[orbit\n", "cannot be read"),
     ],
@@ -251,6 +252,17 @@ def test_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capf
     assert run(["sim", "mitsuba", str(ball(tmp_path)), "-o", str(tmp_path / "o.h5")]) == 6
     assert 'pip install "spikerig[mitsuba]"' in capfd.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["ball.toml", "ball.xml"]
+
+
+def test_effects_chosen_by_the_scene(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """`auto` is settled by the rendered frames; a noise far below the tolerance is left out, one far above is not."""
+    chosen = 'effects = "auto"\nconsider = [{ name = "read_noise", sd = 1e-6 }, { name = "dark_current", rate = 0.5 }]'
+    text = SETTINGS.replace('effects = ["shot_noise", { name = "dark_current", rate = 0.01 }]', chosen)
+    words = ["sim", "mitsuba", str(ball(tmp_path, text)), "-o", str(tmp_path / "o.h5"), "--workers", "1", "--json"]
+    assert run(words) == 0
+    told = json.loads(capfd.readouterr().out)
+    assert "dark_current" in told["effects"]
+    assert "read_noise" not in told["effects"]
 
 
 def test_settings_survive_as_toml() -> None:

@@ -41,6 +41,14 @@ class RollingShutter:
         """Read-out time of one row."""
         return self.readout_ms * 1e6 / height
 
+    def beyond(self, height: int, margin_ticks: int, tick_ns: float) -> str:
+        """What is wrong with margins that do not hold the rows' exposures: in words, empty when they do."""
+        needed = self.row_ns(height) * (height // 2) / tick_ns
+        if needed <= margin_ticks:
+            return ""
+        told = f"is {margin_ticks}, but rolling_shutter exposes the first row {needed:.4g} ticks before the middle one"
+        return f"{told}: raise it, or lower readout_ms"
+
     def begin(self, site: Site) -> Hooks:
         """The same for every view."""
         return Hooks(row_ns=self.row_ns(site.height))
