@@ -146,14 +146,16 @@ def plot(done: Sweep, path: Path) -> None:
         raise HostError("plots need matplotlib", next="pip install 'spikerig[plot]'") from error
     matplotlib.rcParams["svg.hashsalt"] = done.name  # the same numbers give the same file
     figure, axes = plt.subplots(figsize=(7, 4.5), layout="constrained")
+    log = any(r.error > 0 for r in done.rows)  # points without error are then left out
     for series in dict.fromkeys(r.series for r in done.rows):
         rows = [r for r in done.rows if r.series == series]
-        axes.plot([r.cpu_seconds for r in rows], [r.error for r in rows], "o-", label=series, markersize=4)
-        for r in rows:
+        style = "o-" if all(isinstance(r.value, int | float) for r in rows) else "o"  # names have no order
+        axes.plot([r.cpu_seconds for r in rows], [r.error for r in rows], style, label=series, markersize=4)
+        for r in [r for r in rows if not log or r.error > 0]:
             axes.annotate(str(r.value), (r.cpu_seconds, r.error), fontsize=6, xytext=(2, 3), textcoords="offset points")
     axes.set(xscale="log", xlabel="CPU seconds", ylabel=f"error ({done.error_unit})", title=done.title)
-    if all(r.error > 0 for r in done.rows):
-        axes.set_yscale("log")
+    if log:
+        axes.set_yscale("log", nonpositive="mask")
     axes.grid(True, which="both", alpha=0.2)
     axes.legend(fontsize=7)
     figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
+from spikerig.dataset.bayer import PATTERNS
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.info_cli import (
     Axes,
@@ -25,6 +26,7 @@ from spikerig.dataset.info_cli import (
 from spikerig.dataset.terminal import Progress, emit, note
 
 if TYPE_CHECKING:
+    from spikerig.dataset.bayer import ColourTexture
     from spikerig.dataset.spikes import SpikeFile
     from spikerig.dataset.texture import Texture
 
@@ -49,6 +51,9 @@ def texture(
         "auto"
     ),
     view: Annotated[str | None, typer.Option(help="Of a scene: which view.")] = None,
+    bayer: Annotated[
+        str, typer.Option(help="Colours of the pixels: rggb, grbg, gbrg, bggr; off; auto: as the scene says.")
+    ] = "auto",
     height: Height = None,
     width: Width = None,
     row_bits: RowBits = None,
@@ -70,6 +75,8 @@ def texture(
         raise UsageError(f"{method} has no window", value=window, next="leave out --window, or use --method tfp")
     if intervals != 1 and not method.startswith("tfi"):
         raise UsageError(f"{method} has no intervals", value=intervals, next="leave out --intervals")
+    if bayer not in ("auto", "off", *PATTERNS):
+        raise UsageError("no such Bayer pattern", value=bayer, expected=f"auto, off, {', '.join(PATTERNS)}")
     number = _gain(gain)
     refuse_existing(out, force)
     opened = (
@@ -79,11 +86,13 @@ def texture(
     )
     with opened:
         made, used = _make(opened, method, at, 41 if window is None else window, intervals, reach)
+        made, pattern = _coloured(made, bayer, opened)
     used_gain = _write(out, made, number, force)
     told = {
         "file": str(file), "out": str(out), "method": made.method, "at": at, "width": made.light.shape[1],
         "height": made.light.shape[0], "window": [used[0], used[1]], "known": float(made.known.mean()),
         "mean_light": float(made.light[made.known].mean()) if made.known.any() else None, "gain": used_gain,
+        "bayer": pattern,
     }  # fmt: skip
     if as_json:
         emit("spikerig.data.texture/1", told)
@@ -120,7 +129,7 @@ def _view(path: Path, name: str | None) -> SpikeFile:
         raise
     return SpikeFile(
         path, "scene", whole.ticks, whole.height, whole.width, lambda t0, t1: whole.bits[t0:t1], scene.close,
-        whole.rate_hz, whole.t0_ns, whole.clock, whole.lost,
+        whole.rate_hz, whole.t0_ns, whole.clock, whole.lost, {"sensor": scene.info.get("sensor")},
     )  # fmt: skip
 
 
@@ -149,7 +158,15 @@ def _make(
         side = min(4 * side, reach)
 
 
-def _write(out: Path, made: Texture, gain: float | None, force: bool) -> float | None:
+def _coloured(made: Texture, bayer: str, file: SpikeFile) -> tuple[Texture | ColourTexture, str | None]:
+    """The texture, in colour where its pixels see colours, and their pattern."""
+    from spikerig.dataset.bayer import Bayer, bayer_of, demosaic
+
+    colours = Bayer(bayer) if bayer in PATTERNS else bayer_of(file.facts) if bayer == "auto" else None
+    return (made, None) if colours is None else (demosaic(made, colours), colours.pattern)
+
+
+def _write(out: Path, made: Texture | ColourTexture, gain: float | None, force: bool) -> float | None:
     if out.suffix.lower() == ".png":
         from spikerig.dataset.images import texture_png
 

@@ -1,7 +1,6 @@
 """Pictures on disk (PNG, JPEG, OpenEXR) and the sRGB curve. PNG and JPEG hold encoded pixels, EXR holds linear light.
 
-What the libraries get wrong is put right here: cv2's BGR order, OpenEXR's silently wrong pixels for any array that is
-not contiguous and its truncated files that open "successfully" with a part missing.
+What cv2 gets wrong is put right here (the BGR order, damaged files read in part), what OpenEXR does in `exr`.
 """
 
 from __future__ import annotations
@@ -13,11 +12,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spikerig.dataset.bayer import ColourTexture
 from spikerig.dataset.errors import DataError, NumericsError, UsageError
+from spikerig.dataset.exr import check_size, damaged, exr_head, read_exr, write_exr
 from spikerig.dataset.outfile import whole_file
 from spikerig.dataset.texture import Texture
 
-MAX_PIXELS = 1 << 28
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _EXR_START = b"\x76\x2f\x31\x01"
@@ -74,36 +74,42 @@ def _floats(values: ArrayLike) -> NDArray[np.floating]:
     return x if x.dtype == np.float32 else x.astype(np.float64)
 
 
-def read_image(path: str | Path, *, nonfinite: str = "error") -> NDArray[Any]:
-    """Read a picture as it is stored.
+def read_image(path: str | Path, *, nonfinite: str = "error", layer: str = "") -> NDArray[Any]:
+    """Read a picture: encoded pixels of PNG and JPEG, linear light of EXR.
 
     Args:
         path: .png (8 or 16 bit), .jpg or .exr.
         nonfinite: "error", or "keep" to let NaN and infinities of an EXR through.
+        layer: of an EXR: the layer, view, part or channel to read.
 
     Returns:
-        uint8 or uint16 [H,W,C], encoded, from PNG and JPEG; float32 [H,W,C], linear, from EXR; C is 1, 3 or 4,
-        in the order R, G, B, A.
+        uint8 or uint16 [H,W,C] as stored, from PNG and JPEG; float32 [H,W,C], linear Rec.709, from EXR; C is 1, 3 or
+        4, in the order R, G, B, A.
 
     Raises:
         DataError: not a picture, damaged, truncated, too large, or of a kind not handled.
         NumericsError: an EXR holds NaN or infinities.
 
     Edges:
-        An EXR is returned on its display window; where its data window leaves pixels unsaid they are 0.
-        Of a multi-part EXR the first flat part with RGB, RGBA or Y is read. A JPEG's rotation tag is ignored.
+        Which picture of an EXR, and on which window, is said at `exr.read_exr`. A JPEG's rotation tag is ignored.
     """
     source = Path(path)
     start = _start(source)
     if start.startswith(_EXR_START):
-        return _read_exr(source, nonfinite)
+        light = read_exr(source, layer)
+        bad = int((~np.isfinite(light)).sum())
+        if bad and nonfinite != "keep":
+            raise NumericsError("the EXR holds NaN or infinite values", value=f"{source}: {bad} of {light.size}")
+        return light
+    if layer:
+        raise UsageError("only an EXR has layers", value=f"{source}: {layer}")
     if start.startswith(_PNG_START):
         data = source.read_bytes()
         _check_png(source, data)
     elif start.startswith(b"\xff\xd8\xff"):
         data = source.read_bytes()
         if data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
-            raise _damaged(source, "the JPEG has no end marker")
+            raise damaged(source, "the JPEG has no end marker")
     else:
         raise DataError("not a picture this tool reads", value=source, expected="PNG, JPEG or OpenEXR")
     import cv2
@@ -111,9 +117,9 @@ def read_image(path: str | Path, *, nonfinite: str = "error") -> NDArray[Any]:
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
-        raise _damaged(source, str(error)) from error
+        raise damaged(source, str(error)) from error
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
-        raise _damaged(source, "its pixels cannot be decoded")
+        raise damaged(source, "its pixels cannot be decoded")
     if pixels.ndim == 2:
         return pixels[:, :, None]
     order = [2, 1, 0, 3][: pixels.shape[2]]
@@ -140,21 +146,21 @@ def image_head(path: str | Path) -> Head:
         with source.open("rb") as file:
             head = file.read(26)
         width, height = int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
-        _check_size(source, width, height)
+        check_size(source, width, height)
         return Head(width, height, head[25:] in (b"\4", b"\6"))
     if start.startswith(_EXR_START):
-        first = _exr_heads(source)[0]
-        (x0, y0), (x1, y1) = np.asarray(first["displayWindow"], np.int64).tolist()
-        return Head(x1 - x0 + 1, y1 - y0 + 1, any(channel.name == "A" for channel in first["channels"]))
+        return Head(*exr_head(source))
     pixels = read_image(source)
     return Head(pixels.shape[1], pixels.shape[0], pixels.shape[2] == 4)
 
 
-def read_linear(path: str | Path, *, background: float | None = None) -> NDArray[np.float32]:
+def read_linear(
+    path: str | Path, *, background: float | None = None, nonfinite: str = "error", layer: str = ""
+) -> NDArray[np.float32]:
     """Read any picture as linear light, float32[H,W,3]; gray is repeated, alpha is laid over `background`.
 
     Args:
-        path: as for `read_image`.
+        path, nonfinite, layer: as for `read_image`.
         background: linear gray level behind transparent pixels; needed where the picture has alpha.
 
     Raises:
@@ -165,14 +171,18 @@ def read_linear(path: str | Path, *, background: float | None = None) -> NDArray
         Straight alpha of an encoded picture is composited on encoded values, as NeRF's data sets are; an EXR's
         alpha is premultiplied, as its standard says.
     """
-    pixels = read_image(path)
+    pixels = read_image(path, nonfinite=nonfinite, layer=layer)
     linear = pixels.dtype == np.float32
     colour = _floats(pixels)
     if colour.shape[2] == 1:
         colour = np.repeat(colour, 3, axis=2)
     if colour.shape[2] == 4:
         if background is None:
-            raise UsageError("the picture has alpha: say what lies behind it", value=path, next="give a background")
+            raise UsageError(
+                "the picture has alpha: say what lies behind it",
+                value=path,
+                next="give a background (--background 1; of a folder: background in transforms.json)",
+            )
         alpha, colour = colour[:, :, 3:], colour[:, :, :3]
         behind = background if linear else float(srgb_from_linear(background))
         colour = colour * (1 if linear else alpha) + behind * (1 - alpha)
@@ -204,15 +214,17 @@ def write_image(path: str | Path, pixels: ArrayLike, *, force: bool = False) -> 
             expected=".png for uint8 or uint16 (encoded), .exr for floats (linear)",
         )
     with whole_file(target, force=force) as part:
-        (_write_png if whole else _write_exr)(part, array)
+        (_write_png if whole else write_exr)(part, array)
 
 
-def texture_png(path: str | Path, texture: Texture, gain: float | None = None, *, force: bool = False) -> float:
-    """Write a texture as an 8-bit PNG, sRGB(gain * light); pixels not known are transparent.
+def texture_png(
+    path: str | Path, texture: Texture | ColourTexture, gain: float | None = None, *, force: bool = False
+) -> float:
+    """Write a texture as an 8-bit PNG, sRGB(gain * light); pixels not known (in all colours) are transparent.
 
     Args:
         path: of the PNG.
-        texture: light float32[H,W] and known bool[H,W].
+        texture: light float32[H,W] or [H,W,3], known bool of its shape.
         gain: None takes the one that lifts the 99th percentile of known light to white.
         force: replace an existing file.
 
@@ -223,10 +235,12 @@ def texture_png(path: str | Path, texture: Texture, gain: float | None = None, *
         lit = texture.light[texture.known]
         top = float(np.percentile(lit, 99)) if lit.size else 0.0
         gain = 1 / top if top > 0 else 1.0
-    gray = srgb8_from_linear(np.where(texture.known, texture.light, 0) * np.float32(gain))
+    codes = srgb8_from_linear(np.where(texture.known, texture.light, 0) * np.float32(gain))
     if not texture.known.all():
-        gray = np.dstack([gray, gray, gray, np.where(texture.known, 255, 0).astype(np.uint8)])
-    write_image(path, gray, force=force)
+        known = np.atleast_3d(texture.known).all(2)
+        colours = codes if codes.ndim == 3 else np.dstack([codes] * 3)
+        codes = np.dstack([colours, np.where(known, 255, 0).astype(np.uint8)])
+    write_image(path, codes, force=force)
     return gain
 
 
@@ -240,15 +254,6 @@ def _write_png(path: Path, array: NDArray[Any]) -> None:
     path.write_bytes(data.tobytes())
 
 
-def _write_exr(path: Path, array: NDArray[Any]) -> None:
-    import OpenEXR
-
-    pixels = np.ascontiguousarray(array, np.float32)  # OpenEXR writes wrong pixels from any other layout
-    name = {1: "Y", 3: "RGB", 4: "RGBA"}[pixels.shape[2]]
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    OpenEXR.File(header, {name: pixels[:, :, 0].copy() if name == "Y" else pixels}).write(str(path))
-
-
 def _start(path: Path) -> bytes:
     try:
         if not path.is_file():
@@ -257,10 +262,6 @@ def _start(path: Path) -> bytes:
             return file.read(8)
     except OSError as error:
         raise DataError("the picture cannot be opened", value=f"{path}: {error.strerror}") from error
-
-
-def _damaged(path: Path, cause: str) -> DataError:
-    return DataError("the picture is damaged", value=path, cause=cause, next="copy or export it again")
 
 
 def _check_png(path: Path, data: bytes) -> None:
@@ -272,75 +273,9 @@ def _check_png(path: Path, data: bytes) -> None:
         if len(body) != size or zlib.crc32(body, zlib.crc32(kind)) != int.from_bytes(
             data[at + 8 + size : at + 12 + size], "big"
         ):
-            raise _damaged(path, f"the PNG breaks off or is corrupt at byte {at}")
+            raise damaged(path, f"the PNG breaks off or is corrupt at byte {at}")
         if kind == b"IHDR" and size == 13:
-            _check_size(path, int.from_bytes(body[:4], "big"), int.from_bytes(body[4:8], "big"))
+            check_size(path, int.from_bytes(body[:4], "big"), int.from_bytes(body[4:8], "big"))
         at += 12 + size
     if kind != b"IEND":
-        raise _damaged(path, "the PNG has no end")
-
-
-def _check_size(path: Path, width: int, height: int) -> None:
-    if width < 1 or height < 1 or width * height > MAX_PIXELS:
-        raise DataError("the picture's claimed size is refused", value=f"{path}: {width} x {height}")
-
-
-def _exr_heads(path: Path) -> list[dict[str, Any]]:
-    """The headers of all parts, their claimed sizes checked before any pixel is asked for."""
-    import OpenEXR
-
-    try:
-        with OpenEXR.File(str(path), header_only=True) as file:
-            heads = [dict(part.header) for part in file.parts]  # emptied on leaving the `with`
-        for head in heads:
-            for window in ("dataWindow", "displayWindow"):
-                (x0, y0), (x1, y1) = np.asarray(head[window], np.int64).tolist()
-                _check_size(path, x1 - x0 + 1, y1 - y0 + 1)
-    except DataError:
-        raise
-    except Exception as error:  # the binding raises RuntimeError, ValueError, TypeError, as it comes
-        raise _damaged(path, str(error)) from error
-    if not heads:
-        raise _damaged(path, "it has no parts")
-    return heads
-
-
-def _read_exr(path: Path, nonfinite: str) -> NDArray[np.float32]:
-    import OpenEXR
-
-    claimed = _exr_heads(path)
-    try:
-        with OpenEXR.File(str(path)) as file:
-            parts = [(dict(p.header), {name: np.array(c.pixels) for name, c in p.channels.items()}) for p in file.parts]
-    except Exception as error:
-        raise _damaged(path, str(error)) from error
-    if not parts or len(parts) != len(claimed):  # a part whose pixels fail is dropped with a word on stderr
-        raise _damaged(path, f"{len(claimed) - len(parts)} of {len(claimed)} parts cannot be read: truncated?")
-    for header, channels in parts:
-        for name in ("RGBA", "RGB", "Y"):
-            if name in channels and not {"RY", "BY"} & channels.keys() and channels[name].dtype != object:
-                return _on_display(path, header, channels[name], nonfinite)
-    raise DataError(
-        "no RGB, RGBA or Y picture in this EXR",
-        value=f"{path}: " + "; ".join(", ".join(channels) for _, channels in parts),
-        cause="luminance-chroma, deep, or multi-view by channel names: not handled",
-        next="convert it to RGB, e.g. with oiiotool",
-    )
-
-
-def _on_display(path: Path, header: dict[str, Any], pixels: NDArray[Any], nonfinite: str) -> NDArray[np.float32]:
-    pixels = np.asarray(pixels, np.float32)
-    pixels = pixels[:, :, None] if pixels.ndim == 2 else pixels
-    bad = int((~np.isfinite(pixels)).sum())
-    if bad and nonfinite != "keep":
-        raise NumericsError("the EXR holds NaN or infinite values", value=f"{path}: {bad} of {pixels.size}")
-    (ax, ay), (bx, by) = np.asarray(header["dataWindow"], np.int64).tolist()
-    (cx, cy), (dx, dy) = np.asarray(header["displayWindow"], np.int64).tolist()
-    if (ax, ay, bx, by) == (cx, cy, dx, dy):
-        return np.ascontiguousarray(pixels)
-    left, top, right, bottom = max(ax, cx), max(ay, cy), min(bx, dx) + 1, min(by, dy) + 1
-    if left >= right or top >= bottom:
-        raise DataError("the EXR's pixels lie wholly outside its display window", value=path)
-    out = np.zeros((dy - cy + 1, dx - cx + 1, pixels.shape[2]), np.float32)
-    out[top - cy : bottom - cy, left - cx : right - cx] = pixels[top - ay : bottom - ay, left - ax : right - ax]
-    return out
+        raise damaged(path, "the PNG has no end")

@@ -154,6 +154,7 @@ def _scene(path: Path) -> dict[str, Any]:
             if view.spikes is not None:
                 ticks, rate = view.spikes.ticks, view.spikes.rate_hz
         points = scene.points
+        events: dict[str, int] = scene.describe()["events"]
         return {
             "format": "scene",
             "name": scene.name,
@@ -166,6 +167,8 @@ def _scene(path: Path) -> dict[str, Any]:
             "first_view": scene.names[0] if scene.names else None,
             "ticks": ticks,
             "rate_hz": rate,
+            "events": sum(events.values()) if events else None,
+            "event_views": len(events),
             "light_gain": scene.light_gain,
             "points": None if points is None else len(points.xyz),
             "point_source": None if points is None else points.source,

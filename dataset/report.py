@@ -151,7 +151,7 @@ def _capture_row(view: Any, sharp: NDArray, gain: float) -> dict[str, NDArray]:
     at = stream.tick_at(view.frame.mid_ns)
     one = np.unpackbits(stream.bits[int(at)], axis=-1, bitorder="little")[:, : stream.width]
     return {
-        "blurry frame": view.frame.pixels / 255,
+        "blurry frame": view.frame.pixels / view.frame.full,
         "spikes, one tick of 25 us": one.astype(np.float32),
         "TFP, 32 ticks": _srgb(tfp(stream, at, 32).light / gain),
         "TFI": _srgb(tfi(stream, at).light / gain),

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.clocktime import ClockModel, frozen_array
 from spikerig.dataset.errors import DataError, UsageError
+from spikerig.dataset.events import EventStream
 from spikerig.dataset.spikes import SpikeStream
 
 Floats = NDArray[np.float64]
@@ -110,7 +111,7 @@ class Frame:
     """An RGB picture and when it was exposed.
 
     Args:
-        pixels: uint8[H,W,3] encoded by `transfer`.
+        pixels: uint8[H,W,3] encoded by `transfer`; or uint16, full scale 65535, from a camera of more than 8 bits.
         transfer: "srgb" or "linear".
         start_ns: start of exposure of sensor row 0.
         exposure_ns: > 0; 0 for an instantaneous (simulated sharp) picture.
@@ -118,7 +119,7 @@ class Frame:
         clock: name of the clock of `start_ns`.
     """
 
-    pixels: NDArray[np.uint8]
+    pixels: NDArray[np.uint8] | NDArray[np.uint16]
     transfer: str = "srgb"
     start_ns: int = 0
     exposure_ns: int = 0
@@ -126,11 +127,23 @@ class Frame:
     clock: str = "rig"
 
     def __post_init__(self) -> None:
-        _set(self, "pixels", np.uint8)
+        _set(self, "pixels", np.uint16 if self.pixels.dtype == np.uint16 else np.uint8)
         if self.pixels.ndim != 3 or self.pixels.shape[2] != 3:
-            raise DataError("a frame is uint8[H,W,3]", value=self.pixels.shape)
+            raise DataError("a frame is uint8[H,W,3] or uint16[H,W,3]", value=self.pixels.shape)
         if self.transfer not in ("srgb", "linear"):
             raise DataError("unknown transfer of a frame", value=self.transfer, expected="srgb or linear")
+
+    @property
+    def full(self) -> int:
+        """The pixel value of full scale."""
+        return int(np.iinfo(self.pixels.dtype).max)
+
+    @property
+    def pixels8(self) -> NDArray[np.uint8]:
+        """The pixels in 8 bits, rounded where they have more."""
+        return (
+            np.rint(self.pixels / 257).astype(np.uint8) if self.full > 255 else self.pixels.astype(np.uint8, copy=False)
+        )
 
     @property
     def mid_ns(self) -> int:
@@ -217,6 +230,7 @@ class Scene:
     `light_gain` is the texture value (spikes a tick) of RGB white (linear 1.0): known for simulated scenes, measured
     by calibration for real ones, None where unknown. `info` is free provenance, JSON-ready. `clock` is the take's map
     of the spike camera's time to the rig's, `calibration` the rig's as a JSON-ready record; None where there is none.
+    `events` are those of the views that an event camera saw too, by view name.
     """
 
     name: str
@@ -228,6 +242,7 @@ class Scene:
     info: Mapping[str, Any] = field(default_factory=dict)
     clock: ClockModel | None = None
     calibration: Mapping[str, Any] | None = None
+    events: Mapping[str, EventStream] = field(default_factory=dict)
 
     def view(self, name: str) -> View:
         """The view of that name."""

@@ -72,7 +72,7 @@ SCHEMA = r"""
 /views/{view}?                      | group |        | one synchronised look
   @split                            | text  |        | "train" or "test"
   @order                            | int   |        | position in the scene, from 0
-/views/{view}/pixels                | u1    | H W 3  | the RGB frame, encoded
+/views/{view}/pixels                | u1/u2 | H W 3  | the RGB frame, encoded; full scale is the type's largest value
   @transfer                         | text  |        | "srgb" or "linear"
   @start_ns                         | int   |        | start of exposure of sensor row 0
   @exposure_ns                      | int   |        | exposure time
@@ -84,6 +84,16 @@ SCHEMA = r"""
   @t0_ns                            | int   |        | start of tick 0
   @clock                            | text  |        | name of the clock of t0_ns
 /views/{view}/lost?                 | i8    | L 2    | half-open ranges of lost ticks; there if and only if spikes are
+/views/{view}/events?               | group |        | an event camera's look at the same light, in the order of time
+  @width                            | int   |        | pixels a row, at most 65536
+  @height                           | int   |        | rows, at most 65536
+  @t0_ns                            | int   |        | start of the span that was watched
+  @t1_ns                            | int   |        | its end, not in it
+  @clock                            | text  |        | name of the clock of these times
+/views/{view}/events/t_ns           | i8    | N      | times, not decreasing
+/views/{view}/events/x              | u2    | N      | columns
+/views/{view}/events/y              | u2    | N      | rows, 0 on top
+/views/{view}/events/polarity       | i1    | N      | 1 brighter, -1 darker
 /views/{view}/sensor_row            | f4    | H W    | row of the RGB sensor each pixel was read at
 /views/{view}/valid                 | u1    | H W    | 1 where both arms see, else 0
 /views/{view}/pose                  | f8    | 3 4    | cam_from_world of the spike camera, mid-exposure, middle row
@@ -113,7 +123,10 @@ SCHEMA = r"""
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A line of the schema: an object ("group" or a dataset), or an attribute ("text", "int", "float")."""
+    """A line of the schema: an object ("group" or a dataset), or an attribute ("text", "int", "float").
+
+    A dataset's `dtype` may name several, "u1/u2": of these it has one.
+    """
 
     path: str
     dtype: str
@@ -121,6 +134,11 @@ class Row:
     about: str
     required: bool
     attrs: Mapping[str, Row]
+
+    @property
+    def dtypes(self) -> tuple[np.dtype[Any], ...]:
+        """The types a dataset may have."""
+        return tuple(np.dtype("<" + kind) for kind in self.dtype.split("/"))
 
 
 def parse_schema(text: str) -> dict[str, Row]:
@@ -213,7 +231,7 @@ def dataset_at(parent: h5py.Group, name: str) -> h5py.Dataset:
 def check_shape(found: h5py.Dataset) -> None:
     """Refuse a dataset that is not of the type and shape of its row."""
     row = row_of(found.name)
-    if row is None or found.dtype != np.dtype("<" + row.dtype) or len(found.shape) != len(row.shape):
+    if row is None or found.dtype not in row.dtypes or len(found.shape) != len(row.shape):
         raise refuse(spot(found), f"{found.dtype} of shape {found.shape}: not what the schema says")
     if any(isinstance(want, int) and want != n for want, n in zip(row.shape, found.shape, strict=True)):
         raise refuse(spot(found), f"shape {found.shape}, where the schema says {row.shape}")

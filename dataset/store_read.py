@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.clocktime import ClockModel, ns_from_tick
 from spikerig.dataset.errors import DataError, UsageError
+from spikerig.dataset.events import EventStream
 from spikerig.dataset.hdf5_guard import hdf5_faults, names, refuse, spot
 from spikerig.dataset.scene import Camera, Frame, Points, Pose, Scene, Trajectory, Truth, View
 from spikerig.dataset.spikes import SpikeStream
@@ -29,6 +30,7 @@ from spikerig.dataset.store import (
     read_trajectory,
     stored_digest,
 )
+from spikerig.dataset.store_events import check_events, count_events, read_events
 
 
 class SceneFile:
@@ -161,6 +163,40 @@ class SceneFile:
         lost = np.clip(lost - (t0 or 0), 0, len(bits))
         return SpikeStream(bits, width, rate_hz, t0_ns, clock, lost[lost[:, 0] < lost[:, 1]])
 
+    def has_events(self, name: str) -> bool:
+        """Whether an event camera saw this view too."""
+        group = self._group(name)
+        with hdf5_faults(self.path):
+            return has(group, "events")
+
+    def events(self, name: str, t0_ns: int | None = None, t1_ns: int | None = None) -> EventStream:
+        """Events of a view in [t0_ns, t1_ns), by default all; only those are read.
+
+        Raises:
+            UsageError: no such view, no events in it, or a window that ends before it starts.
+
+        Edges:
+            A window that leaves the watched span gives the part inside.
+        """
+        group = self._events_group(name)
+        if t0_ns is not None and t1_ns is not None and t1_ns < t0_ns:
+            raise UsageError("a window ends no sooner than it starts", value=f"[{t0_ns}, {t1_ns}) ns")
+        with hdf5_faults(self.path):
+            return read_events(group, t0_ns, t1_ns)
+
+    def check_events(self, name: str) -> None:
+        """Read all events of a view in bounded memory; a DataError where they are none."""
+        group = self._events_group(name)
+        with hdf5_faults(self.path):
+            check_events(group)
+
+    def _events_group(self, name: str) -> h5py.Group:
+        group = self._group(name)
+        if not self.has_events(name):
+            raise UsageError("this view has no events", value=name, cause="no event camera, or none simulated")
+        with hdf5_faults(self.path):
+            return group_at(group, "events")
+
     def has_true(self, name: str, key: str) -> bool:
         """Whether the truth knows the "light", the instant "at_ns" or the "trajectory" of a view."""
         self._group(name)
@@ -214,10 +250,13 @@ class SceneFile:
     def describe(self) -> dict[str, Any]:
         """What a person asks first, JSON-ready: sizes, counts, names, what is there; nothing large is read."""
         ticks: dict[str, int] = {}
+        events: dict[str, int] = {}
         with hdf5_faults(self.path):
             for name in self.names:
                 group = self._group(name)
                 ticks[name] = dataset_at(group, "spikes").shape[0] if has(group, "spikes") else 0
+                if has(group, "events"):
+                    events[name] = count_events(group_at(group, "events"))
             points = self.points
             return {
                 "format": f"{FORMAT} {read_attr(self._file, 'version')}",
@@ -230,6 +269,7 @@ class SceneFile:
                 "train": list(self.train),
                 "test": list(self.test),
                 "ticks": ticks,
+                "events": events,
                 "points": 0 if points is None else len(points.xyz),
                 "points_source": None if points is None else points.source,
                 "light_gain": self.light_gain,
@@ -243,5 +283,6 @@ class SceneFile:
     def read(self) -> Scene:
         """The whole scene in memory."""
         views = tuple(self.view(name) for name in self.names)
-        more = self.light_gain, self.info, self.clock, self.calibration
+        events = {name: self.events(name) for name in self.names if self.has_events(name)}
+        more = self.light_gain, self.info, self.clock, self.calibration, events
         return Scene(self.name, self.camera, views, self.points, self.truth, *more)

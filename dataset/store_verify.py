@@ -115,6 +115,8 @@ def _check_records(file: h5py.File, path: str) -> Iterator[Finding]:
         elif has(group, "spikes"):
             spikes = dataset_at(group, "spikes")
             yield from _try(where, lambda name=name, spikes=spikes: _read_spikes(scene, name, spikes))
+        if has(group, "events"):
+            yield from _try(f"{where}/events", lambda name=name: scene.check_events(name))
     if scene.has_truth:
         truth = group_at(file, "truth")
         yield from _try("/truth", lambda: (read_clock(group_at(truth, "clock")), read_json(truth, "effects")))

@@ -22,9 +22,11 @@ from numpy.typing import ArrayLike
 
 from spikerig.dataset.clocktime import ClockModel
 from spikerig.dataset.errors import HostError, NumericsError, UsageError
+from spikerig.dataset.events import EventStream
 from spikerig.dataset.hdf5_guard import remember
 from spikerig.dataset.scene import Camera, Points, Scene, Trajectory, Truth, View
 from spikerig.dataset.store import FORMAT, NAME, VERSION, row_of
+from spikerig.dataset.store_events import put_events
 from spikerig.dataset.store_seal import put_attr, seal
 from spikerig.dataset.terminal import jsonable
 
@@ -120,8 +122,11 @@ class SceneWriter:
         light: ArrayLike | None = None,
         at_ns: int | None = None,
         trajectory: Trajectory | None = None,
+        events: EventStream | None = None,
     ) -> None:
         """Write a view, and of a simulated one its truth: sharp linear light [H,W,3], its instant, the exact path.
+
+        `events` are what an event camera saw of it; its size may differ from the camera's.
 
         Raises:
             UsageError: a name taken or not allowed, a size that is not the camera's, truth in a scene without.
@@ -131,6 +136,8 @@ class SceneWriter:
         with disk_faults(self.path):
             group = self._views.create_group(view.name)
             self._put_view(group, view)
+            if events is not None:
+                put_events(group, events)
             self._put_view_truth(view.name, light, at_ns, trajectory)
             seal(group)
             self.names.append(view.name)
@@ -264,13 +271,18 @@ def write(path: str | Path, scene: Scene, force: bool) -> None:
     """What `store.write_scene` does."""
     truth = scene.truth
     if truth is not None:
-        strangers = {*truth.light, *truth.at_ns, *truth.trajectories} - {view.name for view in scene.views}
-        if strangers:
-            raise UsageError("truth of views that the scene does not have", value=sorted(strangers)[:8])
+        _no_strangers("truth", {*truth.light, *truth.at_ns, *truth.trajectories}, scene)
+    _no_strangers("events", {*scene.events}, scene)
     more = {key: getattr(scene, key) for key in ("light_gain", "info", "points", "clock", "calibration")}
     with SceneWriter(path, scene.name, scene.camera, **more, truth=truth, force=force, keep=False) as out:
         for view in scene.views:
-            out.add(view)
+            out.add(view, events=scene.events.get(view.name))
+
+
+def _no_strangers(what: str, known: set[str], scene: Scene) -> None:
+    strangers = known - {view.name for view in scene.views}
+    if strangers:
+        raise UsageError(f"{what} of views that the scene does not have", value=sorted(strangers)[:8])
 
 
 def put(parent: h5py.Group, name: str, values: ArrayLike) -> h5py.Dataset:
@@ -278,7 +290,9 @@ def put(parent: h5py.Group, name: str, values: ArrayLike) -> h5py.Dataset:
     row = row_of(f"{(parent.name or '').rstrip('/')}/{name}")
     if row is None:
         raise UsageError("not in the schema", value=f"{parent.name}/{name}")
-    return parent.create_dataset(name, data=np.ascontiguousarray(values, np.dtype("<" + row.dtype)))
+    values = np.asarray(values)
+    kind = values.dtype if values.dtype in row.dtypes else row.dtypes[0]
+    return parent.create_dataset(name, data=np.ascontiguousarray(values, kind))
 
 
 def put_json(parent: h5py.Group, name: str, record: Mapping[str, Any]) -> None:

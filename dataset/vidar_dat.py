@@ -140,12 +140,16 @@ def write_raster(path: Path, stream: SpikeStream, row_bits: int) -> None:
         raise UsageError("rows on disk must hold the width", value=(row_bits, stream.width))
     with path.open("wb") as file:
         for t in range(0, stream.ticks, _STEP):
-            ticks = stream.bits[t : t + _STEP, ::-1]
-            if row_bits % 8 == 0:
-                rows = np.zeros((len(ticks), raster.height, row_bits // 8), np.uint8)
-                rows[:, :, : ticks.shape[2]] = ticks
-            else:
-                pixels = np.zeros((len(ticks), raster.height, row_bits), np.uint8)
-                pixels[:, :, : raster.width] = np.unpackbits(ticks, axis=2, bitorder="little")[:, :, : raster.width]
-                rows = np.packbits(pixels.reshape(len(ticks), -1), axis=1, bitorder="little")
-            file.write(rows.tobytes())
+            file.write(pack_rows(stream.bits[t : t + _STEP], raster))
+
+
+def pack_rows(bits: Bits, raster: Raster) -> bytes:
+    """Packed ticks [T,H,ceil(W/8)] as the bytes of a raster; the inverse of `unpack_rows`."""
+    ticks = bits[:, ::-1]
+    if raster.row_bits % 8 == 0:
+        rows = np.zeros((len(ticks), raster.height, raster.row_bits // 8), np.uint8)
+        rows[:, :, : ticks.shape[2]] = ticks
+        return rows.tobytes()
+    pixels = np.zeros((len(ticks), raster.height, raster.row_bits), np.uint8)
+    pixels[:, :, : raster.width] = np.unpackbits(ticks, axis=2, bitorder="little")[:, :, : raster.width]
+    return np.packbits(pixels.reshape(len(ticks), -1), axis=1, bitorder="little").tobytes()

@@ -2,6 +2,8 @@
 // would be a crash); the messages for people are in dataset/kernels.py.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
 
 #include <stdexcept>
 
@@ -72,21 +74,51 @@ void tfi_all(Bits bits, int64_t width, Out<uint16_t, nb::ndim<3>> out) {
   DISPATCH(tfi_all, s, out.data());
 }
 
-void fire(In<float, nb::ndim<3>> rows, In<int64_t, nb::ndim<1>> knots, bool hold, Out<uint32_t, nb::ndim<2>> charge,
-          Out<uint8_t, nb::ndim<3>> bits, Out<double, nb::ndim<2>> clipped) {
+using Rows = In<float, nb::ndim<3>>;
+using Knots = In<int64_t, nb::ndim<1>>;
+using Charge = Out<int64_t, nb::ndim<2>>;
+using Fired = Out<uint8_t, nb::ndim<3>>;
+using Image = Out<double, nb::ndim<2>>;
+using Key = std::array<uint32_t, 2>;
+
+spikerig::Light light_of(const Rows &rows, const Knots &knots, bool hold, int64_t begin, const Charge &charge,
+                         const Fired &bits, const Image &lost) {
   const auto count = static_cast<int64_t>(knots.shape(0));
   need(count >= 1, "at least one knot");
   const spikerig::Light light{rows.data(), knots.data(), count - 1, static_cast<int64_t>(rows.shape(1)),
-                              static_cast<int64_t>(rows.shape(2)), hold};
+                              static_cast<int64_t>(rows.shape(2)), hold, begin,
+                              begin + static_cast<int64_t>(bits.shape(0))};
   need(static_cast<int64_t>(rows.shape(0)) >= (hold ? count - 1 : count), "too few light rows");
   for (int64_t k = 1; k < count; ++k) need(knots.data()[k] >= knots.data()[k - 1], "knots must not decrease");
   const spikerig::Packed s{bits.data(), static_cast<int64_t>(bits.shape(0)), light.height, light.width};
   need(light.width >= 1 && static_cast<int64_t>(bits.shape(1)) == s.height &&
-           static_cast<int64_t>(bits.shape(2)) == s.row() && s.ticks == knots.data()[count - 1] - knots.data()[0],
-       "bits must be uint8[T,H,ceil(W/8)] with T the span of the knots");
-  need(image(charge, s) && image(clipped, s), "charge and clipped must be [H,W]");
+           static_cast<int64_t>(bits.shape(2)) == s.row(),
+       "bits must be uint8[T,H,ceil(W/8)]");
+  need(knots.data()[0] <= light.begin && light.end <= knots.data()[count - 1], "ticks must lie within the knots");
+  need(image(charge, s) && image(lost, s), "charge and clipped must be [H,W]");
+  return light;
+}
+
+void fire(Rows rows, Knots knots, bool hold, int64_t begin, bool carry, Charge charge, Fired bits, Image clipped) {
+  const auto light = light_of(rows, knots, hold, begin, charge, bits, clipped);
   nb::gil_scoped_release release;
-  DISPATCH(fire, light, charge.data(), bits.data(), clipped.data());
+  DISPATCH(fire, light, carry, charge.data(), bits.data(), clipped.data());
+}
+
+void fire_noisy(Rows rows, Knots knots, bool hold, int64_t begin, int64_t first_tick, bool carry,
+                std::optional<In<float, nb::ndim<2>>> electrons, Key shot_key, float sd, Key comparator_key,
+                uint32_t loss, std::optional<In<uint8_t, nb::ndim<2>>> before, Charge charge, Fired bits, Image lost) {
+  const auto light = light_of(rows, knots, hold, begin, charge, bits, lost);
+  need(!electrons || (electrons->shape(0) == rows.shape(1) && electrons->shape(1) == rows.shape(2)),
+       "electrons must be [H,W]");
+  need(!before || (before->shape(0) == bits.shape(1) && before->shape(1) == bits.shape(2)),
+       "before must be uint8[H,ceil(W/8)]");
+  need(light.height * light.width <= UINT32_MAX, "too many pixels");
+  const spikerig::Noise noise{electrons ? electrons->data() : nullptr, {shot_key[0], shot_key[1]}, sd,
+                              {comparator_key[0], comparator_key[1]}, loss};
+  nb::gil_scoped_release release;
+  DISPATCH(fire_noisy, light, first_tick, noise, carry, charge.data(), before ? before->data() : nullptr, bits.data(),
+           lost.data());
 }
 
 }  // namespace
@@ -96,5 +128,8 @@ void bind_spikes(nb::module_ &m) {
   m.def("count", &count, "bits"_a, "width"_a, "t0"_a, "t1"_a, "out"_a);
   m.def("tfi_at", &tfi_at, "bits"_a, "width"_a, "tick"_a, "before"_a, "after"_a, "previous"_a, "next"_a);
   m.def("tfi_all", &tfi_all, "bits"_a, "width"_a, "out"_a);
-  m.def("fire", &fire, "light"_a, "knots"_a, "hold"_a, "charge"_a, "bits"_a, "clipped"_a);
+  m.def("fire", &fire, "light"_a, "knots"_a, "hold"_a, "begin"_a, "carry"_a, "charge"_a, "bits"_a, "clipped"_a);
+  m.def("fire_noisy", &fire_noisy, "light"_a, "knots"_a, "hold"_a, "begin"_a, "first_tick"_a, "carry"_a,
+        "electrons"_a.none(), "shot_key"_a, "sd"_a, "comparator_key"_a, "loss"_a, "before"_a.none(), "charge"_a,
+        "bits"_a, "lost"_a);
 }

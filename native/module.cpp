@@ -8,6 +8,7 @@
 namespace nb = nanobind;
 
 void bind_spikes(nb::module_ &m);
+void bind_events(nb::module_ &m);
 void bind_train(nb::module_ &m);
 void bind_light(nb::module_ &m);
 
@@ -19,6 +20,7 @@ NB_MODULE(_native, m) {
   m.def("threads", &spikerig::threads, "Size of the kernels' thread team.");
   m.def("set_threads", &spikerig::set_threads, nb::arg("n"), "Set the thread team's size (1..256).");
   bind_spikes(m);
+  bind_events(m);
   bind_train(m);
   bind_light(m);
 }

@@ -52,6 +52,27 @@ struct Light {
   const int64_t *knots;    // int64[segments + 1]
   int64_t segments, height, width;
   bool hold;               // rows[k] over segment k; else linear from rows[k] to rows[k + 1]
+  int64_t begin, end;      // ticks that are run, within the knots
+  int64_t ticks() const { return end - begin; }
+};
+
+// Calls run(k, ticks, done, first) for each segment that is run at least in part: how many ticks the segment has, how
+// many of them were before, and the tick it starts with; run(k, ...) runs first .. min(knots[k + 1], end).
+template <class Run>
+void each_segment(const Light &light, Run run) {
+  for (int64_t k = 0; k < light.segments; ++k) {
+    const int64_t from = light.knots[k], to = light.knots[k + 1], first = std::max(from, light.begin);
+    if (first < std::min(to, light.end)) run(k, to - from, first - from, first);
+  }
+}
+
+// Noise of fire_noisy(), in dataset/sim_oracles.py.
+struct Noise {
+  const float *electrons;      // [height, width] electrons that make a threshold; null: no shot noise
+  uint32_t shot_key[2];
+  float sd;                    // of the comparator, thresholds; 0: no noise
+  uint32_t comparator_key[2];
+  uint32_t loss;               // share of a tick's light lost after a spike, in 2^-32
 };
 
 #define SPIKERIG_DECLARE_SPIKE_KERNELS(isa)                                                                     \
@@ -60,7 +81,9 @@ struct Light {
   void count(const Packed &s, int64_t t0, int64_t t1, uint32_t *out);                                           \
   void tfi_at(const Packed &s, int64_t tick, int before, int after, int32_t *previous, int32_t *next);          \
   void tfi_all(const Packed &s, uint16_t *out);                                                                 \
-  void fire(const Light &light, uint32_t *charge, uint8_t *bits, double *clipped);                              \
+  void fire(const Light &light, bool carry, int64_t *charge, uint8_t *bits, double *clipped);                   \
+  void fire_noisy(const Light &light, int64_t first_tick, const Noise &noise, bool carry, int64_t *charge,      \
+                  const uint8_t *before, uint8_t *bits, double *lost);                                          \
   }
 SPIKERIG_EACH_ISA(SPIKERIG_DECLARE_SPIKE_KERNELS)
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from spikerig.dataset.clocktime import ClockModel
+from spikerig.dataset.events import EventStream, no_events
 from spikerig.dataset.scene import Camera, Frame, Points, Pose, Scene, Trajectory, Truth, View
 from spikerig.dataset.spikes import SpikeStream
 
@@ -29,6 +30,14 @@ def stream(ticks: int, seed: int, rate_hz: float | None = 40_000.0) -> SpikeStre
     for a, b in lost:
         on[a:b] = False
     return SpikeStream(np.packbits(on, axis=2, bitorder="little"), W, rate_hz, -1234567, "spike-clock", lost)
+
+
+def events(count: int, seed: int = 0, height: int = H, width: int = W, span_ns: int = 20_000_000) -> EventStream:
+    """So many events, evenly spread over a span that starts at 2^60."""
+    rng, t0 = np.random.default_rng(seed), 2**60
+    t = np.sort(rng.integers(t0, t0 + span_ns, count))
+    x, y = rng.integers(0, width, count, np.uint16), rng.integers(0, height, count, np.uint16)
+    return EventStream(t, x, y, rng.choice(np.array([-1, 1], np.int8), count), height, width, t0, t0 + span_ns, "dvs")
 
 
 def view(i: int) -> View:
@@ -66,7 +75,9 @@ def full_scene() -> Scene:
     points = Points(rng.standard_normal((17, 3)), rng.integers(0, 256, (17, 3), dtype=np.uint8), "simulator")
     camera = Camera(np.array([[30.0, 0, 10.5], [0, 31, 6.5], [0, 0, 1]]), np.array([0.1, -0.2, 0.3, 1e-17]), W, H)
     info = {"made": "üß", "n": [1, 2.5, None], "deep": {"k": True}}
-    return Scene("scène 1", camera, views, points, truth, 0.1 + 0.2, info, clock, {"id": "cal-1", "mirror": {"arm": 1}})
+    calibration = {"id": "cal-1", "mirror": {"arm": 1}}
+    seen = {"v-01.x": events(777), "Z9": no_events(5, 4, -3, -3, "é")}
+    return Scene("scène 1", camera, views, points, truth, 0.1 + 0.2, info, clock, calibration, seen)
 
 
 def same(a: Any, b: Any, where: str = "scene") -> None:
@@ -232,7 +243,7 @@ ROWS = [
         "luminance-chroma, deep, multi-view, tiled, lone channels",
         "read_image (EXR)",
         "read or refused, as listed",
-        "dataset/test_images.py::test_awkward_exr_files_are_read_or_refused",
+        "dataset/test_exr.py::test_awkward_exr_files_are_read_or_refused",
     ),
     (
         "a picture claiming 100,000 x 100,000",

@@ -136,9 +136,12 @@ def render(
     run: Annotated[Path, typer.Argument(help="Folder of a run.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the pictures.")],
     path: Annotated[
-        str, typer.Option(help="test, train, orbit, shake, or a transforms.json (OpenGL camera-to-world).")
+        str,
+        typer.Option(help="test, train, orbit, shake, or a transforms.json: NeRF's frames, or a layout of sub-frames."),
     ] = "test",
-    format: Annotated[str, typer.Option(help="png (sRGB) or exr (linear light).")] = "png",
+    format: Annotated[
+        str | None, typer.Option(help="png (sRGB) or exr (linear light); exr for a shake, else png.")
+    ] = None,
     frames: Annotated[int, typer.Option(help="Pictures of an orbit.")] = 60,
     subframes: Annotated[int, typer.Option(help="Sub-exposures of a view on a shake path.")] = 18,
     shake_px: Annotated[tuple[float, float], typer.Option(help="Length of a shake path, from and to, pixels.")] = (
@@ -152,13 +155,14 @@ def render(
 ) -> None:
     """Draw a run's scene along a path of cameras.
 
-    `shake` writes sub-exposures of every view, shaken by a seeded hand, with the layout that
-    `spikerig sim frames` turns into spikes and blurry frames.
+    Every folder gets a transforms.json that `spikerig sim frames` reads. `shake` writes sub-exposures of every view,
+    shaken by a seeded hand, with phases, depth and the scene's split: spikes and blurry frames of a scene that moves.
     """
     from spikerig.dataset.store import open_scene
     from spikerig.train.record import open_run
     from spikerig.train.render import render_path
 
+    format = format or ("exr" if path == "shake" else "png")
     if format not in ("png", "exr"):
         raise UsageError("no such picture format", value=format, expected="png or exr")
     opened = open_run(run)
@@ -168,7 +172,7 @@ def render(
             opened.model, file, path, out,
             suffix=format, frames=frames, subframes=subframes, shake_px=shake_px, seed=seed,
         )  # fmt: skip
-    note(f"{len(written)} pictures in {out}")
+    note(f"{len(written) - 1} pictures in {out}, laid out in {written[-1]}")
     if as_json:
         emit("spikerig.train.render/1", {"run": str(run), "path": path, "folder": str(out), "pictures": written})
 

@@ -24,7 +24,7 @@ def kernels(
     if as_json:
         emit("spikerig.cost.kernels/1", {"kernels": rows, "machine": where, "command": machine.command()})
         return
-    typer.echo(f"{'kernel':<9}{'ms':>9}{'oracle ms':>12}{'ratio':>8}  size")
+    typer.echo(f"{'kernel':<17}{'ms':>9}{'oracle ms':>12}{'ratio':>8}  size")
     for row in rows:
         more = ""
         if "splat_pixels_per_second" in row:
@@ -32,8 +32,10 @@ def kernels(
                 f", {row['consulted_per_pixel']:.0f} splats consulted a pixel, "
                 f"{row['splat_pixels_per_second'] / 1e6:.0f} M splat-pixels/s"
             )
+        if "ns_per_pixel_tick" in row:
+            more = f", {row['ticks_per_second']:.0f} ticks/s, {row['ns_per_pixel_tick']:.2f} ns a pixel and tick"
         typer.echo(
-            f"{row['kernel']:<9}{row['seconds'] * 1e3:>9.3f}{row['oracle_seconds'] * 1e3:>12.2f}"
+            f"{row['kernel']:<17}{row['seconds'] * 1e3:>9.3f}{row['oracle_seconds'] * 1e3:>12.2f}"
             f"{row['ratio']:>8.1f}  {row['size']}{more}"
         )
     typer.echo(machine.caption(where | {"threads": 1}))

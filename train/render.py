@@ -1,4 +1,4 @@
-"""Pictures of a trained scene along a path of cameras; `shake` writes what `spikerig sim frames` reads."""
+"""Pictures of a trained scene along a path of cameras, laid out so that `spikerig sim frames` reads them."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.scene import Floats
 from spikerig.dataset.terminal import progress
+from spikerig.train.layout import FILE, Layout, frame_row, is_layout, label_of, read_layout, write_layout
 from spikerig.train.model import Model
 from spikerig.train.start import SH0
 from spikerig.train.trajectory import between, compose, exp_se3, inverse
@@ -52,9 +53,11 @@ def render_path(
     Args:
         model: what to draw.
         scene: whose views the paths test, train, orbit and shake go by.
-        path: test, train, orbit, shake, or the name of a transforms.json (OpenGL camera-to-world).
+        path: test, train, orbit, shake, or the name of a transforms.json: NeRF's list of frames, or a layout of
+            views and sub-frames as in docs/sim_frames.md, which is drawn as it stands (its camera, its files).
         out: an existing folder; pictures in it are replaced.
-        suffix: png (8-bit sRGB) or exr (linear light, clipped to 0..1 as the model's colours are).
+        suffix: png (8-bit sRGB) or exr (linear light, clipped to 0..1 as the model's colours are); a layout names
+            its files itself.
         frames: pictures of an orbit, >= 2.
         subframes: sub-exposures within an exposure of a shake, >= 2; the margins come on top.
         shake_px: range of the path length of the image centre over an exposure, pixels.
@@ -74,10 +77,39 @@ def render_path(
         )
     if path == "shake":
         return _shake(model, scene, out, suffix, subframes, shake_px, seed)
+    if path.endswith(".json") and is_layout(record := _load(Path(path))):
+        return _layout(model, read_layout(Path(path), record, model.camera), out)
+    if path.endswith(".json") and Path(path).resolve() == (out / FILE).resolve():
+        raise UsageError("the pictures' own transforms.json would replace this file", value=path, next="another folder")
     shots = list(_shots(model, scene, path, frames, suffix))
     for shot in progress(shots, "rendering", "picture"):
         _write(out / shot.file, model.picture(shot.cam_from_world))
-    return [shot.file for shot in shots]
+    split = "test" if path == "test" else "train"
+    views = [
+        {"name": Path(s.file).stem, "split": split, "frames": [frame_row(s.file, s.cam_from_world)]} for s in shots
+    ]
+    return [*(shot.file for shot in shots), write_layout(out, model.camera, views)]
+
+
+def _layout(model: Model, layout: Layout, out: Path) -> list[str]:
+    """Every picture and depth of a layout, with its transforms.json."""
+    seen = replace(model, camera=layout.camera)
+    for file, pose in progress(layout.pictures, "rendering", "picture"):
+        (out / file).parent.mkdir(parents=True, exist_ok=True)
+        _write(out / file, seen.picture(pose))
+    for file, pose in layout.depths:
+        (out / file).parent.mkdir(parents=True, exist_ok=True)
+        _write_exr(out / file, depth_picture(seen, pose))
+    (out / FILE).write_text(json.dumps(layout.document, indent=1) + "\n", encoding="utf-8")
+    return [*(file for file, _ in layout.pictures + layout.depths), FILE]
+
+
+def _load(path: Path) -> Any:
+    """What a JSON file holds; None where it cannot be read (whoever reads it next says why)."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
 
 
 def _shots(model: Model, scene: SceneFile, path: str, frames: int, suffix: str) -> Iterator[Shot]:
@@ -159,14 +191,14 @@ def _shake(
     step = 1 / (subframes - 1)
     extra = int(np.ceil(MARGIN / step))
     phases = np.arange(-extra, subframes + extra) * step
-    label = subframes // 2 - (1 if subframes % 2 == 0 else 0)  # the frame nearest to mid-exposure, the earlier of two
+    label = float(phases[label_of(phases)])
     views, files = [], []
     for k, name in enumerate(progress(scene.names, "rendering shaken views", "view")):
         base = scene.view(name, spikes=False).pose.cam_from_world
         if name in scene.test:
             files.append(f"{name}.{suffix}")
             _write(out / files[-1], model.picture(base))
-            views.append({"name": name, "split": "test", "frames": [_frame(files[-1], base)]})
+            views.append({"name": name, "split": "test", "frames": [frame_row(files[-1], base)]})
             continue
         rng = np.random.default_rng(np.random.SeedSequence([seed, k]))
         path = shake(model, base, float(rng.uniform(*shake_px)), rng)
@@ -175,18 +207,12 @@ def _shake(
         for number, phase in enumerate(phases):
             file, pose = f"{name}/{number:03d}.{suffix}", path(phase)
             _write(out / file, model.picture(pose))
-            shown.append({**_frame(file, pose), "phase": float(phase)})
+            shown.append({**frame_row(file, pose), "phase": float(phase)})
         depth = f"{name}/depth.exr"
-        _write_exr(out / depth, depth_picture(model, path(label * step)))
+        _write_exr(out / depth, depth_picture(model, path(label)))
         files += [s["file"] for s in shown] + [depth]
         views.append({"name": name, "split": "train", "depth": depth, "frames": shown})
-    camera = model.camera
-    document = {
-        "fl_x": camera.K[0, 0], "fl_y": camera.K[1, 1], "cx": camera.K[0, 2], "cy": camera.K[1, 2],
-        "w": camera.width, "h": camera.height, "views": views,
-    }  # fmt: skip
-    (out / "transforms.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    return [*files, "transforms.json"]
+    return [*files, write_layout(out, model.camera, views)]
 
 
 def depth_picture(model: Model, cam_from_world: Floats) -> NDArray[np.float32]:
@@ -201,12 +227,6 @@ def depth_picture(model: Model, cam_from_world: Floats) -> NDArray[np.float32]:
         alpha = drawn.alpha.cpu().numpy()
         depth = drawn.image[:, :, 0].cpu().numpy() / np.maximum(alpha, 0.5) * (far / model.gauge.scale)
     return np.where(alpha >= 0.5, depth, np.inf).astype(np.float32)
-
-
-def _frame(file: str, cam_from_world: Floats) -> dict[str, Any]:
-    world_from_cam = np.vstack([inverse(cam_from_world), [0, 0, 0, 1]])
-    world_from_cam[:3, 1:3] *= -1  # OpenCV's y down and z forward to OpenGL's y up and z backward
-    return {"file": file, "transform_matrix": world_from_cam.tolist()}
 
 
 def _write(path: Path, codes: NDArray[np.float32]) -> None:

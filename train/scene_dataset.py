@@ -87,7 +87,7 @@ class SceneDataset(Dataset[dict[str, Any]]):
     def __getitem__(self, index: int) -> dict[str, Any]:
         scene = self._scene()
         view = scene.view(self.names[index])
-        codes = view.frame.pixels.astype(np.float32) / 255
+        codes = view.frame.pixels.astype(np.float32) / view.frame.full
         if (view.frame.transfer, self.encoding) == ("srgb", "linear"):
             codes = linear_from_srgb(codes)
         elif (view.frame.transfer, self.encoding) == ("linear", "srgb"):

@@ -38,7 +38,7 @@ def novel_views(scene: SceneFile) -> tuple[list[Exam], str]:
     if sharp and all(e is not None for e in sharp):
         return [e for e in sharp if e is not None], SHARP
     stored = [scene.view(name, spikes=False) for name in scene.test]
-    return [Exam(v.name, v.pose.cam_from_world, _codes(v.frame.pixels, v.frame.transfer)) for v in stored], STORED
+    return [Exam(v.name, v.pose.cam_from_world, _codes(v.frame.pixels8, v.frame.transfer)) for v in stored], STORED
 
 
 def blur_views(scene: SceneFile) -> list[Exam]:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from spikerig.dataset.bayer import bayer_of
 from spikerig.dataset.clocktime import ClockModel
 from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.scene import Floats, View
@@ -166,13 +167,20 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
         gauge: poses are given in it.
 
     Raises:
-        DataError: no training views, no spikes, no trajectory or no truth where the method needs it.
+        DataError: no training views, no spikes, no trajectory or no truth where the method needs it; a colour spike
+            camera.
     Cost: a texture takes milliseconds; memory 12 bytes a pixel and view, +4 a texture, +6 a ratio instant.
     """
     if not scene.train:
         raise DataError("this scene has no training views", value=scene.name, next="spikerig data info FILE")
     if config.colour_target == "truth" and not scene.has_truth:
         raise DataError("this method trains on the sharp truth", value=scene.name, expected=NEEDS_TRUTH)
+    if config.needs_spikes and bayer_of(scene.info) is not None:
+        raise DataError(
+            "the spikes of this scene see colours, and the losses on spikes compare gray",
+            value=scene.name,
+            expected="a scene of a gray spike camera, or a method without spikes",
+        )
     colour = phases(config.poses_per_view, config.instants_rule, config.pose_label)
     tfs = phases(config.textures_per_view, config.instants_rule, config.pose_label) if config.tfs_weight > 0 else ()
     ratio = phases(config.ratio_instants, "midpoints", config.pose_label) if config.ratio_until > 0 else ()
@@ -204,7 +212,7 @@ def _read(
 
     colour, tfs, ratio = instants
     view = scene.view(name, spikes=config.needs_spikes)
-    decode = np.arange(256) / 255.0
+    decode = np.arange(view.frame.full + 1) / view.frame.full
     if view.frame.transfer == "srgb":
         decode = linear_from_srgb(decode)
     light = np.asarray(decode, np.float32)[view.frame.pixels]
@@ -222,7 +230,7 @@ def _read(
     if config.needs_spikes:
         clock = scene.clock
         mean, known = exposure_mean(view, clock)
-        pairs.add(view.frame.pixels, light, mean, known & view.valid)
+        pairs.add(view.frame.pixels8, light, mean, known & view.valid)
         made["mean"], made["mean_known"] = mean, known
         for phase in dict.fromkeys((*tfs, *ratio)):
             tick = spike_tick(view, instant_ns(view.frame, phase), clock)

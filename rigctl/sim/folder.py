@@ -16,16 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.errors import DataError, RigError, UsageError
-from spikerig.dataset.images import read_image
+from spikerig.dataset.images import image_head
 from spikerig.dataset.scene import Camera
 from spikerig.rigctl.sim.limits import Faults
+from spikerig.rigctl.sim.pictures import check_mending
 from spikerig.rigctl.sim.schedule import Schedule, Track
 from spikerig.rigctl.sim.spec import Settings, read_settings
 from spikerig.rigctl.sim.take import Rig
 
 OPENGL = np.diag([1.0, -1.0, -1.0])  # camera axes: y up and z back, to y down and z ahead
 KEYS = {
-    "": {"views", "camera_angle_x", "fl_x", "fl_y", "cx", "cy", "w", "h", "background", "points", "name"},
+    "": {"views", "camera_angle_x", "fl_x", "fl_y", "cx", "cy", "w", "h", "background", "points", "name", "layer"},
     "view": {"name", "split", "frames", "depth"},
     "frame": {"file", "transform_matrix", "phase"},
 }
@@ -52,24 +53,32 @@ class Folder:
     views: tuple[Sequence, ...]
     background: float | None
     points: Path | None
+    layer: str = ""
+    bad_values: str = "refuse"
 
 
 def read_folder(
-    folder: str | Path, settings: str | Path | None = None, *, protocol: str = "", seed: int | None = None
+    folder: str | Path,
+    settings: str | Path | None = None,
+    *,
+    protocol: str = "",
+    seed: int | None = None,
+    bad_values: str = "refuse",
 ) -> Folder:
     """Read transforms.json and the settings, and look at every file named.
 
     Args:
         folder: with transforms.json.
-        settings: a TOML file with any of name, seed and the tables exposure, sensor, effects and points of a scene
-            file; None takes capture.toml of the folder, and defaults where that is missing.
+        settings: a TOML file with any of name, seed and the tables exposure, sensor, effects, events and points of a
+            scene file; None takes capture.toml of the folder, and defaults where that is missing.
         protocol, seed: in place of the settings'.
+        bad_values: what becomes of NaN, infinite and negative values: refuse, zero or clip (see `pictures.mend`).
 
     Raises:
         DataError: transforms.json is missing, not JSON, or any of what it says is wrong: all faults at once.
         UsageError: wrong settings.
     """
-    root = Path(folder)
+    root, bad_values = Path(folder), check_mending(bad_values)
     read = _settings(root, settings, protocol, seed)
     table = _transforms(root)
     faults = Faults("transforms.json", DataError, "the layout is in docs/sim_frames.md")
@@ -89,22 +98,30 @@ def read_folder(
     background = table.get("background")
     if background is not None and not (isinstance(background, int | float) and 0 <= background <= 1):
         faults.add("background", f"is {background!r}, expected a linear gray level, 0 to 1")
+    layer = table.get("layer", "")
+    if not isinstance(layer, str):
+        faults.add("layer", f"is {layer!r}, expected the name of a layer of the EXR pictures")
     if camera is None and not faults.found:
         faults.add("views", "hold no picture that can be read")
     faults.raise_any()
     name = read.name or str(table.get("name") or root.resolve().name)
-    rig = Rig(name, read.seed, cast(Camera, camera), read.exposure, read.sensor, read.effects)
-    return Folder(rig, read, tuple(v for v in views if v is not None), background, points)
+    rig = Rig(name, read.seed, cast(Camera, camera), read.exposure, read.sensor, read.effects, read.events)
+    return Folder(rig, read, tuple(v for v in views if v is not None), background, points, layer, bad_values)
+
+
+def settings_table(root: Path, file: str | Path | None = None) -> dict[str, Any]:
+    """What the settings of a folder hold, not looked at yet: of the file given, or of capture.toml; else empty."""
+    path = Path(file) if file is not None else root / "capture.toml"
+    if file is None and not path.exists():
+        return {}
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise UsageError("the settings cannot be read", value=f"{path}: {error}") from None
 
 
 def _settings(root: Path, file: str | Path | None, protocol: str, seed: int | None) -> Settings:
-    path = Path(file) if file is not None else root / "capture.toml"
-    table: dict[str, Any] = {}
-    if file is not None or path.exists():
-        try:
-            table = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-            raise UsageError("the settings cannot be read", value=f"{path}: {error}") from None
+    path, table = Path(file) if file is not None else root / "capture.toml", settings_table(root, file)
     if protocol:
         exposure = table.get("exposure", {})
         table["exposure"] = {**exposure, "protocol": protocol} if isinstance(exposure, dict) else exposure
@@ -155,7 +172,7 @@ def _camera(root: Path, table: Mapping[str, Any], faults: Faults) -> Camera | No
     for row in table.get("views") or []:
         try:
             file = _inside(root, row["frames"][0]["file"], "", Faults(""))
-            size = read_image(file, nonfinite="keep").shape[:2] if file else None
+            size = image_head(file) if file else None
         except (RigError, LookupError, TypeError):
             continue
         if size:
@@ -163,7 +180,7 @@ def _camera(root: Path, table: Mapping[str, Any], faults: Faults) -> Camera | No
     given = [_number(table, key, faults, 0, 16385) for key in ("w", "h")]
     if size is None:
         return None  # every view tells of its own missing picture
-    height, width = size
+    width, height, _ = size
     for key, value, real in (("w", given[0], width), ("h", given[1], height)):
         if value is not None and value != real:
             faults.add(key, f"is {value:g}, but the first picture has {real}")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.rigctl.sim.world import Box, Rect, Room, Solid, Sphere
+from spikerig.rigctl.sim.solids import Box, Rect, Room, Sphere
 
 Floats = NDArray[np.floating]  # float32 unless said
 Axes = Sequence[Floats | np.floating]  # a vector, axis by axis
@@ -35,7 +35,10 @@ def dot(p: Axes, axis: tuple[float, float, float]) -> Floats:
 
 
 def screen(
-    solid: Solid, cam_from_world: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]
+    solid: Room | Box | Sphere | Rect,
+    cam_from_world: NDArray[np.float64],
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
 ) -> tuple[slice, slice] | None:
     """The part of the band that a solid's bounding ball can touch, as slices; None when it is out of sight."""
     if isinstance(solid, Room):
@@ -63,24 +66,24 @@ def screen(
     return slices[0], slices[1]
 
 
-def _hit_room(room: Room, first: int, o: Axes, d: Axes, depth: Floats, face: NDArray[np.int16]) -> None:
+def _hit_room(room: Room, first: int, o: Axes, d: Axes, depth: Floats, face: NDArray[np.int32]) -> None:
     for axis in range(3):
         up = d[axis] > 0
         t = (np.where(up, np.float32(room.hi[axis]), np.float32(room.lo[axis])) - o[axis]) / d[axis]
         nearer = t < depth
         np.copyto(depth, t, where=nearer)
-        np.copyto(face, up + np.int16(first + 2 * axis), where=nearer)
+        np.copyto(face, up + np.int32(first + 2 * axis), where=nearer)
 
 
-def _hit_box(box: Box, first: int, o: Axes, d: Axes, depth: Floats, face: NDArray[np.int16]) -> None:
+def _hit_box(box: Box, first: int, o: Axes, d: Axes, depth: Floats, face: NDArray[np.int32]) -> None:
     o, d = box_frame(box, [o[a] - np.float32(box.centre[a]) for a in range(3)], d)
-    enter, leave, side = np.float32(-np.inf), np.float32(np.inf), np.int16(0)
+    enter, leave, side = np.float32(-np.inf), np.float32(np.inf), np.int32(0)
     for axis in range(3):
         inv = 1 / d[axis]
         half = np.float32(box.size[axis] / 2) * np.abs(inv)
         mid = -o[axis] * inv
         a, b = mid - half, mid + half
-        low = (d[axis] < 0) + np.int16(first + 2 * axis)  # moving up the axis it enters by the low side
+        low = (d[axis] < 0) + np.int32(first + 2 * axis)  # moving up the axis it enters by the low side
         side = np.where(a > enter, low, side)
         enter, leave = np.maximum(enter, a), np.minimum(leave, b)
     hit = (enter < leave) & (enter > NEAR) & (enter < depth)
@@ -97,7 +100,7 @@ def box_frame(box: Box, o: Axes, d: Axes) -> tuple[Axes, Axes]:
     return [c * o[0] + s * o[1], c * o[1] - s * o[0], o[2]], turned
 
 
-def _hit_sphere(ball: Sphere, first: int, o: Axes, d: Axes, depth: Floats, face: NDArray[np.int16]) -> None:
+def _hit_sphere(ball: Sphere, first: int, o: Axes, d: Axes, depth: Floats, face: NDArray[np.int32]) -> None:
     q = [np.float32(o[a] - np.float32(ball.centre[a])) for a in range(3)]
     a, b = dot3(d, d), dot3(d, q)
     c = np.float32(float(q[0]) ** 2 + float(q[1]) ** 2 + float(q[2]) ** 2 - ball.radius**2)
@@ -105,10 +108,10 @@ def _hit_sphere(ball: Sphere, first: int, o: Axes, d: Axes, depth: Floats, face:
     t = (-b - np.sqrt(inside)) / a
     hit = (inside > 0) & (t > NEAR) & (t < depth)
     np.copyto(depth, t, where=hit)
-    np.copyto(face, np.int16(first), where=hit)
+    np.copyto(face, np.int32(first), where=hit)
 
 
-def _hit_rect(rect: Rect, first: int, o: Axes, d: Axes, depth: Floats, face: NDArray[np.int16]) -> None:
+def _hit_rect(rect: Rect, first: int, o: Axes, d: Axes, depth: Floats, face: NDArray[np.int32]) -> None:
     right, up = np.array(rect.right), np.array(rect.up)
     n = vec3(np.cross(right, up))
     q = [np.float32(rect.centre[a]) - o[a] for a in range(3)]
@@ -117,7 +120,7 @@ def _hit_rect(rect: Rect, first: int, o: Axes, d: Axes, depth: Floats, face: NDA
     u, v = dot(away, vec3(right / (right @ right))), dot(away, vec3(up / (up @ up)))
     hit = (np.abs(u) < 1) & (np.abs(v) < 1) & (t > NEAR) & (t < depth)
     np.copyto(depth, t, where=hit)
-    np.copyto(face, np.int16(first), where=hit)
+    np.copyto(face, np.int32(first), where=hit)
 
 
 HIT = {Room: _hit_room, Box: _hit_box, Sphere: _hit_sphere, Rect: _hit_rect}

@@ -8,9 +8,10 @@ import re
 from typing import Any
 
 from spikerig.rigctl.sim.effects import EFFECTS, effect_class
+from spikerig.rigctl.sim.events import EventCamera
 from spikerig.rigctl.sim.orbit import Orbit
 from spikerig.rigctl.sim.pattern import Texture
-from spikerig.rigctl.sim.spec import PAPER, Cloud, Exposure, Lens, Sensor, Shake
+from spikerig.rigctl.sim.spec import PAPER, Cloud, Exposure, Lens, RgbCamera, Sensor, Shake, Tolerance
 from spikerig.rigctl.sim.world import KINDS, Air, Lamp
 
 TABLES: tuple[tuple[str, type], ...] = (
@@ -19,18 +20,24 @@ TABLES: tuple[tuple[str, type], ...] = (
     ("shake", Shake),
     ("exposure", Exposure),
     ("sensor", Sensor),
+    ("rgb", RgbCamera),
+    ("events", EventCamera),
+    ("tolerance", Tolerance),
     ("points", Cloud),
     ("world.lamp", Lamp),
 )
 
 HEAD = """# Scene files
 
-What `spikerig sim capture` plays: a TOML file, or the name of a built-in scene (`demo`, `chroma`), which are the best
-examples (`rigctl/sim/scenes/`). Every key has a default unless it says *required*. Unknown keys, wrong types and values
-out of range are told all at once. This page is made by `python -m spikerig.rigctl.sim.page > docs/scenes.md`.
+What `spikerig sim capture` plays: a TOML file, or the name of a built-in scene, which are the best examples
+(`rigctl/sim/scenes/`: `demo`, `chroma`, and the six of [synthetic.md](synthetic.md)). Every key has a default unless it
+says *required*. Unknown keys, wrong types and values out of range are told all at once. This page is made by
+`python -m spikerig.rigctl.sim.page > docs/scenes.md`.
 
 At the top: `name`; `seed` (of shake, noise and points; the world has its own seeds and does not change with it);
-`effects`, a list of names or of tables `{ name = "...", parameter = value }`, each at most once.
+`effects`, a list of names or of tables `{ name = "...", parameter = value }`, each at most once; or the word `"auto"`,
+which takes of those to choose from what matters for this scene, or `"all"` of them. To choose from are the effects of
+the presets, and those listed in `consider` (same form), whose parameters go before a preset's.
 
 World axes: z up, right-handed. All light and reflectances are linear, 1.0 is display white.
 """
@@ -46,15 +53,20 @@ def page() -> str:
     parts.append("## `[world]`\n\n" + _about(Air) + _rows(Air))
     for kind, record in KINDS.items():
         parts.append(f'### `[[world.solids]]`, `kind = "{kind}"`\n\n{_about(record)}{_rows(record)}')
-    parts.append(f"### Textures: `texture`, `floor`, `ceiling`, `walls`\n\n{_about(Texture)}{_rows(Texture)}")
-    parts.append("## Effects\n\nThey act in this order. Each draws from its own random stream of (seed, name, view).\n")
+    parts.append(
+        f"### Textures: `texture`, `floor`, `ceiling`, `walls`, `bark`, `leaf`\n\n{_about(Texture)}{_rows(Texture)}"
+    )
+    parts.append(
+        "## Effects\n\nThey act in this order. Each draws from its own random stream of (seed, name, view).\n"
+        "Blur by motion is none of them: it is the exposure itself, `[exposure]` and `[shake]`.\n"
+    )
     for name in EFFECTS:
         effect: Any = effect_class(name)
         parts.append(
             f"### `{name}`\n\n{_about(effect)}{_rows(effect)}\n"
             f"- Stage: {effect.stage.name}\n- Vanishes: {effect.vanishes}\n- Source: {effect.source}\n"
-            f"- Bound on the change, in {effect.unit}: {_first(effect.magnitude.__doc__)}\n"
-            f"- Cost: about {effect.cost_ns:g} ns a pixel and {'tick' if effect.per_tick else 'knot or picture'}\n"
+            f"- Bound on the change: {_first(effect.magnitude.__doc__)}\n"
+            f"- Cost: about {effect.cost_ns:g} ns a pixel and {effect.per}\n"
         )
     return "\n".join(part.rstrip("\n") + "\n" for part in parts)
 

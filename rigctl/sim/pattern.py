@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from spikerig.rigctl.sim.limits import limits
 
 Floats = NDArray[np.floating]  # float32 unless said
-KINDS = ("plain", "tiles", "checker", "stripes", "noise", "star", "edge")
-CELLS = 64  # tiles and noise repeat after this many cells
+KINDS = ("plain", "tiles", "checker", "stripes", "noise", "star", "edge", "weave")
+CUTS = ("none", "leaf", "disc", "mesh", "grille")
+CELLS = 64  # tiles, noise and threads repeat after this many cells
+SIDES, DIVES = 0.7, 0.4  # how dark a thread gets at its sides, and where it dives under another
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,14 +23,23 @@ class Texture:
     Args:
         kind: plain (a), tiles (random colour a cell), checker (a and b), stripes (a to b, a cosine along u turned by
             `angle_deg`), noise (value noise a to b, two octaves), star (Siemens star of `spokes`, on b), edge (a | b,
-            slanted by `angle_deg`).
+            slanted by `angle_deg`), weave (plain weave of round threads: a runs along v, b along u, one a cell).
         size: edge of a cell or the period, in world units.
         a, b: linear reflectances (r, g, b).
-        luma, chroma: ranges of a tile's luma (Rec.601 of linear light) and chroma; hue is uniform.
+        luma, chroma: ranges of a tile's luma (Rec.601 of linear light) and chroma; hue is uniform. Each thread of a
+            weave is times a number from the range `luma`.
         tint: multiplies all of it (r, g, b): tiles and patterns of one hue.
         spokes: pairs of the star.
         seed: of tiles and noise; the world does not change with the scene's seed.
         emit: light given off, as a multiple of the albedo; > 0 makes a lamp (HDR when the product exceeds 1).
+        cut: what is cut away, and seen and lit through: none, all but a pointed `leaf` or an ellipse (`disc`) on a
+            panel, the square holes of a `mesh`, the round holes of a `grille`.
+        cut_size: from hole to hole; on round solids the nearest that closes around them.
+        open: share of a mesh or grille that is hole.
+        gloss: mirror reflectance seen head-on (plastic 0.04, metal 0.9); 0 is matt. Mirrors show the room (or the sky)
+            and the lamp, no solids.
+        rough: width of the lamp's highlight and blur of the mirror; GGX-like alpha is its square.
+        metal: 1 gives the mirror the texture's colour and takes the matt part away.
     """
 
     kind: str = limits("plain", choices=KINDS)
@@ -42,14 +53,22 @@ class Texture:
     spokes: int = limits(18, 1, 1000)
     seed: int = limits(0, 0, 2**32 - 1)
     emit: float = limits(0.0, 0, 1e9)
+    cut: str = limits("none", choices=CUTS)
+    cut_size: float = limits(0.02, 1e-4, 1e3, "world units")
+    open: float = limits(0.5, 0.01, 0.9)
+    gloss: float = limits(0.0, 0, 1)
+    rough: float = limits(0.3, 0.1, 1)
+    metal: float = limits(0.0, 0, 1)
 
 
 def lattice(texture: Texture) -> Floats:
-    """The table that tiles and noise look up: float32[3, CELLS*CELLS] colours, or [1, CELLS*CELLS] noise values."""
+    """What patterns look up: float32[3, CELLS*CELLS] tile colours, [1, CELLS*CELLS] noise, [2, CELLS] threads."""
     rng = np.random.default_rng(np.random.SeedSequence([texture.seed, KINDS.index(texture.kind)]))
     n = CELLS * CELLS
     if texture.kind == "noise":
         return rng.random((1, n), dtype=np.float32)
+    if texture.kind == "weave":
+        return rng.uniform(*texture.luma, (2, CELLS)).astype(np.float32)
     if texture.kind != "tiles":
         return np.zeros((3, 0), np.float32)
     luma = rng.uniform(*texture.luma, n)
@@ -80,6 +99,8 @@ def albedo(texture: Texture, table: Floats, u: Floats, v: Floats) -> Floats:
         return np.broadcast_to((np.array(texture.a) * texture.tint).astype(np.float32)[:, None], (3, u.size))
     if texture.kind == "tiles":
         return np.take(table, _cell(u, v, texture.size), axis=1)
+    if texture.kind == "weave":
+        return _weave(texture, table, u, v)
     return _mix(texture, _weight(texture, table, u, v))
 
 
@@ -113,6 +134,21 @@ def _weight(texture: Texture, table: Floats, u: Floats, v: Floats) -> Floats:
     coarse = _noise(table, u * scale, v * scale)
     fine = _noise(table, u * (2 * scale) + np.float32(17), v * (2 * scale) + np.float32(29))
     return coarse * np.float32(2 / 3) + fine * np.float32(1 / 3)
+
+
+def _weave(texture: Texture, table: Floats, u: Floats, v: Floats) -> Floats:
+    """Threads over and under each other: a thread is darker towards its sides and where it dives under."""
+    scale = np.float32(1 / texture.size)
+    x, y = u * scale, v * scale
+    i, j = np.floor(x), np.floor(y)
+    x, y = x - i - np.float32(0.5), y - j - np.float32(0.5)
+    i, j = i.astype(np.int32), j.astype(np.int32)
+    top = ((i + j) & 1).astype(bool)  # the thread along v (colour a, one a column) is on top
+    across, along = np.where(top, x, y), np.where(top, y, x)
+    shade = (1 - np.float32(4 * SIDES) * across * across) * (1 - np.float32(4 * DIVES) * along * along)
+    shade *= np.where(top, table[0].take(i & (CELLS - 1)), table[1].take(j & (CELLS - 1)))
+    a, b = ((np.array(c) * texture.tint).astype(np.float32)[:, None] for c in (texture.a, texture.b))
+    return np.where(top, a, b) * shade
 
 
 def _noise(table: Floats, x: Floats, y: Floats) -> Floats:

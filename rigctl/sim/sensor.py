@@ -1,21 +1,22 @@
-"""Two sensors under the same light: integrate-and-fire pixels, and an RGB camera that averages its exposure."""
+"""Light over time, and the spike sensor under it: pixels that integrate and fire."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spikerig.dataset.bayer import mosaic
 from spikerig.dataset.errors import NumericsError, UsageError
-from spikerig.dataset.images import srgb_from_linear
 from spikerig.dataset.kernels import fire
+from spikerig.dataset.sim_kernels import fire_noisy
 from spikerig.rigctl.sim.effects import Hooks
 from spikerig.rigctl.sim.spec import Sensor
 
 Floats = NDArray[np.floating]  # float32 unless said
-BLOCK = 300_000  # pixel-ticks of light made at once where an effect needs every tick
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +29,7 @@ class Light:
         exposure: (first tick, end tick) of the RGB exposure; both are knots.
         rate_hz: ticks a second.
         t0_ns: start of tick knots[0].
+        arm: what the RGB arm sees, where that is not what the spike arm sees (as rgb).
     """
 
     rgb: Floats
@@ -35,9 +37,12 @@ class Light:
     exposure: tuple[int, int]
     rate_hz: float
     t0_ns: int = 0
+    arm: Floats | None = None
 
     def __post_init__(self) -> None:
         k = len(self.rgb)
+        if self.arm is not None and self.arm.shape != self.rgb.shape:
+            raise UsageError("the two arms' light differs in shape", value=self.arm.shape, expected=str(self.rgb.shape))
         if self.rgb.ndim != 4 or self.rgb.shape[3] != 3 or len(self.knots) not in (k, k + 1):
             raise UsageError("light is rgb[K,H,W,3] with K or K+1 knots", value=(self.rgb.shape, len(self.knots)))
         if np.any(np.diff(self.knots) <= 0):
@@ -50,25 +55,89 @@ class Light:
         """Whether pictures hold rather than blend."""
         return len(self.knots) == len(self.rgb) + 1
 
-    def weights(self) -> NDArray[np.float64]:
-        """Share of each picture in the exposure, float64[K], sum 1: trapezoid rule, or slot lengths where they hold."""
-        inside = np.diff(self.knots) * ((self.knots[:-1] >= self.exposure[0]) & (self.knots[1:] <= self.exposure[1]))
-        if self.hold:
-            return inside / inside.sum()
-        both = np.concatenate([inside, [0]]) + np.concatenate([[0], inside])
-        return both / both.sum()
+    @property
+    def at_s(self) -> NDArray[np.float64]:
+        """The rig's time at each picture, seconds, float64[K]: at its knot, or the middle of the slot it holds for."""
+        knots = self.knots.astype(np.float64)
+        ticks = (knots[:-1] + knots[1:]) / 2 if self.hold else knots
+        return self.t0_ns * 1e-9 + (ticks - knots[0]) / self.rate_hz
+
+
+def refined(light: Light, step_s: float) -> Light:
+    """The same light with samples no further apart than asked for; a new one, whose pictures may be changed.
+
+    Args:
+        light: linear in time between its knots, or held.
+        step_s: longest time between samples; not below a tick.
+
+    Edges:
+        No step asked for (0) only copies. Where pictures hold, a slot that is cut holds the same picture in its parts.
+    """
+    most = max(1.0, step_s * light.rate_hz) if step_s > 0 else np.inf
+    spans = np.diff(light.knots)
+    parts = np.clip(np.ceil(spans / most - 1e-9), 1, spans).astype(np.int64)
+    if not parts.size or parts.max() == 1:  # nothing to cut
+        return replace(light, rgb=light.rgb.copy(), arm=None if light.arm is None else light.arm.copy())
+    k = np.repeat(np.arange(len(spans)), parts)
+    first = np.concatenate([[0], np.cumsum(parts)[:-1]])
+    share = (np.arange(len(k)) - np.repeat(first, parts)) / parts[k]
+    cut = np.rint(light.knots[k] + share * spans[k]).astype(np.int64)
+    knots = np.append(cut, light.knots[-1])
+
+    def along(pictures: Floats) -> Floats:
+        if light.hold:
+            return pictures[k]
+        w = ((cut - light.knots[k]) / spans[k]).astype(np.float32)[:, None, None, None]
+        inner = pictures[k] * (1 - w) + pictures[k + 1] * w
+        return np.concatenate([inner, pictures[-1:]])
+
+    return replace(light, rgb=along(light.rgb), knots=knots, arm=None if light.arm is None else along(light.arm))
+
+
+def delayed(light: Floats, knots: NDArray[np.int64], by: NDArray[np.float64]) -> tuple[Floats, NDArray[np.int64]]:
+    """Light as a sensor sees it whose tick n looks at time n - by: its clock is ahead.
+
+    Args:
+        light: float32[K,H,W] at knots [K] (linear) or [K+1] (hold).
+        knots: ticks.
+        by: ticks, float64 at each knot; what is asked for beyond the ends stands still.
+
+    Returns:
+        The light on a grid that has a knot at the nearest tick to each kink, and its knots.
+    """
+    if not np.any(by):
+        return light, knots
+    hold = len(knots) == len(light) + 1
+    moved = knots + by
+    if np.any(np.diff(moved) <= 0):
+        raise UsageError("a clock may not run backwards within a view", value=by)
+    inner = np.clip(np.rint(moved), knots[0], knots[-1]).astype(np.int64)
+    grid = np.unique(np.concatenate([[knots[0], knots[-1]], inner]))
+    if hold:
+        slot = np.clip(np.searchsorted(moved, (grid[:-1] + grid[1:]) / 2, side="right") - 1, 0, len(light) - 1)
+        return light[slot], grid
+    at = np.clip(grid, moved[0], moved[-1])
+    k = np.clip(np.searchsorted(moved, at, side="right") - 1, 0, len(light) - 2)
+    w = ((at - moved[k]) / (moved[k + 1] - moved[k])).astype(np.float32)[:, None, None]
+    return light[k] * (1 - w) + light[k + 1] * w, grid
 
 
 def spike_light(rgb: Floats, sensor: Sensor) -> Floats:
-    """Light as the spike pixels see it, in thresholds a tick: gain * (response . rgb), float32[K,H,W].
+    """Light as the spike pixels see it, in thresholds a tick, float32[K,H,W].
+
+    gain * (response . rgb); of a colour sensor gain * channel_gain * its own colour.
 
     Raises:
         NumericsError: a value is negative or not finite.
     """
-    k = np.array(sensor.response, np.float32) * np.float32(sensor.gain)
-    light = rgb[..., 0] * k[0]
-    light += rgb[..., 1] * k[1]
-    light += rgb[..., 2] * k[2]
+    if sensor.bayer is not None:
+        light = mosaic(rgb, sensor.bayer)
+        light *= np.float32(sensor.gain)
+    else:
+        k = np.array(sensor.response, np.float32) * np.float32(sensor.gain)
+        light = rgb[..., 0] * k[0]
+        light += rgb[..., 1] * k[1]
+        light += rgb[..., 2] * k[2]
     if not (np.min(light, initial=0) >= 0 and np.isfinite(np.max(light, initial=0))):
         bad = int(np.count_nonzero(~(light >= 0) | ~np.isfinite(light)))
         raise NumericsError("light must be finite and not negative", value=f"{bad} of {light.size} values are not")
@@ -76,73 +145,37 @@ def spike_light(rgb: Floats, sensor: Sensor) -> Floats:
 
 
 def integrate(
-    light: Floats, knots: NDArray[np.int64], start: NDArray[np.float64], steps: Sequence[tuple[bool, Hooks]] = ()
-) -> tuple[NDArray[np.uint8], NDArray[np.uint32], NDArray[np.float64]]:
+    light: Floats, knots: NDArray[np.int64], start: NDArray[np.float64], steps: Sequence[Hooks] = ()
+) -> tuple[NDArray[np.uint8], NDArray[np.uint32] | NDArray[np.int64], NDArray[np.float64]]:
     """Integrate and fire (Eq. 5 and 6), the surplus kept, at most one spike a tick.
 
     Args:
         light: float32[K,H,W], thresholds a tick; taken over (effects may change it in place).
         knots: int64[K] or [K+1], as in `Light`.
         start: float64[H,W] charge before the first tick, 0 to 1 thresholds.
-        steps: (per_tick, hooks) of the effects in stage order.
+        steps: hooks of the effects in stage order.
 
     Returns:
-        bits uint8[T,H,ceil(W/8)], charge left uint32[H,W] in 2^-32 thresholds, charge clipped float64[H,W] in
-        thresholds: in = fired + left + clipped.
+        bits uint8[T,H,ceil(W/8)]; charge left [H,W] in 2^-32 thresholds, uint32, or int64 where effects inside the
+        pixel can leave it below 0 or above one; charge lost (clipped, or gone in resets) float64[H,W] in thresholds:
+        in = fired + left + lost, `in` after shot noise.
+
+    Raises:
+        UsageError: two effects that set the same thing inside a pixel.
 
     Cost:
-        Without per-tick effects the light is only touched at its knots.
+        The light is only touched at its knots; effects inside the pixel cost what their kernel does.
     """
-    hooks = [(per_tick, h.light) for per_tick, h in steps if h.light is not None]
-    first = next((i for i, (per_tick, _) in enumerate(hooks) if per_tick), len(hooks))
-    for _, change in hooks[:first]:
-        change(light)
+    pixel: dict[str, Any] = {}
+    for h in steps:
+        if h.light is not None:
+            h.light(light)
+        twice = set(pixel) & set(h.pixel)
+        if twice:
+            raise UsageError("two effects set the same thing inside a pixel", value=", ".join(sorted(twice)))
+        pixel |= h.pixel
     charge = np.minimum(np.floor(start * 2.0**32), 2.0**32 - 1).astype(np.uint32)
     hold = len(knots) == len(light) + 1
-    if first == len(hooks):
-        return fire(light, knots, charge, hold=hold)
-    bits = np.empty((int(knots[-1] - knots[0]), light.shape[1], (light.shape[2] + 7) // 8), np.uint8)
-    clipped = np.zeros(light.shape[1:])
-    at = 0
-    for block in _ticks(light, knots, hold):
-        for _, change in hooks[first:]:
-            change(block)
-        n = len(block)
-        bits[at : at + n], charge, lost = fire(block, np.arange(n + 1), charge, hold=True)
-        clipped += lost
-        at += n
-    return bits, charge, clipped
-
-
-def _ticks(light: Floats, knots: NDArray[np.int64], hold: bool) -> Iterable[Floats]:
-    """The light of every tick (at its midpoint), in blocks float32[n,H,W]."""
-    most = max(1, BLOCK // max(1, light[0].size))
-    for k in range(len(knots) - 1):
-        ticks = int(knots[k + 1] - knots[k])
-        for top in range(0, ticks, most):
-            n = min(most, ticks - top)
-            if hold:
-                yield np.repeat(light[k : k + 1], n, axis=0)
-            else:
-                w = ((np.arange(top, top + n) + 0.5) / ticks).astype(np.float32)[:, None, None]
-                block = (light[k + 1] - light[k]) * w
-                block += light[k]
-                yield block
-
-
-def expose(light: Light) -> NDArray[np.float64]:
-    """Mean linear light over the exposure, float64[H,W,3]."""
-    total = np.zeros(light.rgb.shape[1:])
-    for weight, picture in zip(light.weights(), light.rgb, strict=True):
-        if weight:
-            total += weight * picture
-    return total
-
-
-def encode(linear: NDArray, hooks: Iterable[Hooks] = ()) -> NDArray[np.uint8]:
-    """8-bit sRGB of linear light: clip to 0..1, sRGB, the effects on the encoded picture, round; uint8[H,W,3]."""
-    picture = srgb_from_linear(np.clip(linear, 0, 1)).astype(np.float32)
-    for h in hooks:
-        if h.encoded is not None:
-            h.encoded(picture)
-    return np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
+    if not set(pixel) - {"carry"}:
+        return fire(light, knots, charge, hold=hold, **pixel)
+    return fire_noisy(light, knots, charge, hold=hold, **pixel)

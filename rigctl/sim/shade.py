@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spikerig.rigctl.sim.crowd import Crowd
 from spikerig.rigctl.sim.hits import NEAR, Axes, Floats, box_frame, dot, dot3, vec3
+from spikerig.rigctl.sim.parts import Ints, place
 from spikerig.rigctl.sim.pattern import Texture, lattice
-from spikerig.rigctl.sim.world import Box, Rect, Room, Solid, Sphere, Vec3, World
+from spikerig.rigctl.sim.solids import Box, Rect, Room, Sphere, Vec3
+from spikerig.rigctl.sim.world import World
 
 TEXELS = 256  # along the longest edge of any face
+CROWDED = 256  # along the edges of a crowd's sides at most
+MOST = 400_000  # texels of a crowd at most
+POINTS = 1 << 16  # of a crowd lit at once
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,6 +52,13 @@ class Face:
         r = np.float32(self.radius)
         return np.arctan2(q[1], q[0]) * r, np.arcsin(np.clip(q[2] / r, -1, 1)) * r
 
+    def normals(self, p: Axes, flip: bool) -> Axes:
+        """Unit normals at points of the face; of the other side where `flip`."""
+        if self.normal is None:
+            return [(p[a] - np.float32(self.centre[a])) * np.float32(1 / self.radius) for a in range(3)]
+        size = np.linalg.norm(self.normal) * (-1 if flip else 1)
+        return [np.broadcast_to(np.float32(self.normal[a] / size), np.shape(p[0])) for a in range(3)]
+
     def place(self, u: Floats, v: Floats, flip: bool) -> tuple[Axes, Axes]:
         """Points and unit normals at coordinates; the other side's normals where `flip`. The inverse of the above."""
         c = np.array(self.centre)[:, None]
@@ -58,7 +72,7 @@ class Face:
         return list(p.astype(np.float32)), list(n.astype(np.float32))
 
 
-def faces_of(solid: Solid) -> list[Face]:
+def faces_of(solid: Room | Box | Sphere | Rect) -> list[Face]:
     """The faces of a solid, in the order its hit function numbers them."""
     if isinstance(solid, Sphere):
         skin, r = solid.texture, solid.radius
@@ -96,13 +110,14 @@ def _side(solid: Room | Box, side: int) -> Face:
     return Face(skin, lattice(skin), normal, centre, vec3(axes[u]), vec3(axes[v]), lo, hi)
 
 
-def irradiance(world: World, p: Axes, n: Axes) -> tuple[Floats, Floats]:
+def irradiance(world: World, p: Axes, n: Axes, crowds: Sequence[Crowd] = ()) -> tuple[Floats, Floats]:
     """Light on surface points.
 
     Args:
         world: lamp and solids.
         p: points, float32[n] an axis.
         n: unit normals, float32[n] or scalar an axis.
+        crowds: what else throws shadows.
 
     Returns:
         direct float32[n]: the lamp's power is multiplied by this (cosine over squared distance, 0 in shadow); open
@@ -113,12 +128,19 @@ def irradiance(world: World, p: Axes, n: Axes) -> tuple[Floats, Floats]:
     direct = np.maximum(dot3(to, n), 0) / (r2 * np.sqrt(r2))
     shut = np.zeros_like(direct)
     for solid in world.solids:
-        if isinstance(solid, Sphere | Box):
+        if isinstance(solid, Sphere | Box) and solid.texture.cut == "none":
             away = [p[a] - np.float32(solid.centre[a]) for a in range(3)]
             if world.contact > 0:
                 shut += _contact(solid, away, n)
             if world.lamp.shadows:
                 direct *= ~_shadowed(solid, away, to, r2)
+    for crowd in crowds:
+        if world.contact > 0:
+            centre, size = crowd.blob
+            shut += _cover([p[a] - np.float32(centre[a]) for a in range(3)], n, size)
+        if world.lamp.shadows:
+            lit = np.flatnonzero(direct)
+            direct[lit] *= ~crowd.shadowed(world.lamp.position, [np.asarray(c)[lit] for c in p])
     return direct, 1 - np.float32(world.contact) * np.minimum(shut, 1)
 
 
@@ -165,7 +187,7 @@ def _bilinear(table: Floats, corners: list[NDArray[np.intp]], x: Floats, y: Floa
     return a
 
 
-def light_map(world: World, face: Face, flip: bool, texel: float) -> LightMap:
+def light_map(world: World, face: Face, flip: bool, texel: float, crowds: Sequence[Crowd] = ()) -> LightMap:
     """The table of a face, seen from the side of its normal or (`flip`) from the other; texels of that size."""
     counts = [int(np.clip(np.ceil((face.hi[k] - face.lo[k]) / texel), 16, 4 * TEXELS)) for k in (0, 1)]
     spots = [
@@ -174,11 +196,64 @@ def light_map(world: World, face: Face, flip: bool, texel: float) -> LightMap:
     u, v = np.meshgrid(*spots)
     p, n = face.place(u.reshape(-1), v.reshape(-1), flip)
     tables = []
-    for part in irradiance(world, p, n):
+    for part in irradiance(world, p, n, crowds):
         cells = part.reshape(counts[1], 2, counts[0], 2)
         tables.append(cells.mean((1, 3), dtype=np.float32).reshape(-1))
     scale = (counts[0] / (face.hi[0] - face.lo[0]), counts[1] / (face.hi[1] - face.lo[1]))
     return LightMap(tables[0], tables[1], counts[0], counts[1], scale, face.lo)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CrowdMap:
+    """Irradiance of every side of every part of a crowd: [part, side, rows, columns] texels, read bilinearly.
+
+    Args:
+        direct, open: the tables, flat.
+        shape, sides: of the parts; a ball's and a rod's round side close around it.
+        edge: rows, and columns, of a side.
+    """
+
+    direct: Floats
+    open: Floats
+    shape: str
+    sides: int
+    edge: int
+
+    def at(self, part: Ints, side: Ints, s: Floats, t: Floats) -> tuple[Floats, Floats]:
+        """`irradiance` at places 0 to 1 along the sides' u and v, float32[n] each."""
+        top = np.float32(self.edge - 1.001)
+        x, y = (c * np.float32(self.edge) - np.float32(0.5) for c in (s, t))
+        y = np.clip(y, 0, top)
+        if self.shape == "rect" or self.shape == "box":
+            x = np.clip(x, 0, top)
+        elif self.shape == "rod":
+            x = np.where(side % 3 == 0, x, np.clip(x, 0, top))
+        left, j = np.floor(x), y.astype(np.intp)
+        x, y, i = x - left, y - j, left.astype(np.intp) % self.edge
+        at = ((part * self.sides + side).astype(np.intp) * self.edge + j) * self.edge
+        right = at + (i + 1) % self.edge
+        at += i
+        corners = [at, right, at + self.edge, right + self.edge]
+        return _bilinear(self.direct, corners, x, y), _bilinear(self.open, corners, x, y)
+
+
+def crowd_map(world: World, crowd: Crowd, texel: float, crowds: Sequence[Crowd]) -> CrowdMap:
+    """The table of a crowd, texels of about that size, at most MOST of them but no fewer than 2x2 a side."""
+    parts = crowd.parts
+    n, sides = len(parts), parts.sides
+    longest = parts.half.max() * (2 * np.pi if parts.shape in ("ball", "rod") else 2)
+    edge = int(min(np.ceil(longest / texel), np.sqrt(MOST / (n * sides)), CROWDED))
+    edge = max(edge, 2)
+    spots = (np.arange(2 * edge) + 0.5) / (2 * edge)
+    s, t = (c.reshape(-1) for c in np.meshgrid(spots, spots))
+    tables = [np.empty((n, sides, edge, edge), np.float32) for _ in range(2)]
+    for side in range(sides):
+        points, normals = place(parts, side, s, t)
+        for k in range(0, n, step := max(1, POINTS // len(s))):
+            p, m = (list(c[k : k + step].reshape(-1, 3).T.astype(np.float32)) for c in (points, normals))
+            for table, part in zip(tables, irradiance(world, p, m, crowds), strict=True):
+                table[k : k + step, side] = part.reshape(-1, edge, 2, edge, 2).mean((2, 4), dtype=np.float32)
+    return CrowdMap(tables[0].reshape(-1), tables[1].reshape(-1), parts.shape, sides, edge)
 
 
 def _shadowed(solid: Sphere | Box, away: Axes, to: Axes, r2: Floats) -> NDArray[np.bool_]:
@@ -199,7 +274,10 @@ def _shadowed(solid: Sphere | Box, away: Axes, to: Axes, r2: Floats) -> NDArray[
 
 def _contact(solid: Sphere | Box, away: Axes, n: Axes) -> Floats:
     """How much of the sky over a point a solid covers: the solid angle of a ball in its place, weighted by cosine."""
-    size = solid.radius if isinstance(solid, Sphere) else 0.62 * float(np.prod(solid.size)) ** (1 / 3)
+    return _cover(away, n, solid.radius if isinstance(solid, Sphere) else 0.62 * float(np.prod(solid.size)) ** (1 / 3))
+
+
+def _cover(away: Axes, n: Axes, size: float) -> Floats:
     r2 = np.maximum(dot3(away, away), np.float32(size * size))
     below = np.maximum(-dot3(away, n), 0)
     return below * np.float32(size * size) / (r2 * np.sqrt(r2))

@@ -12,10 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from spikerig.dataset.bayer import PATTERNS, Bayer
 from spikerig.dataset.errors import UsageError
-from spikerig.rigctl.sim.effects import Effect, read_effects
+from spikerig.rigctl.sim.effects import Effect, effect_class, in_order, read_effects, settled
+from spikerig.rigctl.sim.events import EventCamera
 from spikerig.rigctl.sim.limits import Faults, limits, nearest, read_record
 from spikerig.rigctl.sim.orbit import Orbit, orbit_pose
+from spikerig.rigctl.sim.presets import PRESETS, preset_effects, preset_names
 from spikerig.rigctl.sim.world import Vec3, World, read_world, stands_in
 
 
@@ -54,7 +57,8 @@ class Exposure:
         protocol: `rig` (40 kHz over a real exposure) or `paper` (18 one-bit samples an exposure, threshold 2); a
             protocol only sets defaults.
         exposure_ms, rate_hz: their product is the ticks of an exposure, a whole number.
-        sub_poses: pictures cast over an exposure, ends included (`linear`) or one a slot (`hold`).
+        sub_poses: pictures cast over an exposure, ends included (`linear`) or one a slot (`hold`); 0 for as many as
+            the view's motion asks for, one every 0.25 px, which is the default with `effects = "auto"`.
         margin_ticks: spikes kept on each side of the exposure.
         light: between sub-poses the light is `linear` in time, or each `hold`s for its slot.
         label: the instant a view is labelled with and its sharp truth is cast: `mid` exposure, or its `first` sub-pose.
@@ -65,7 +69,7 @@ class Exposure:
     protocol: str = limits("rig", choices=("rig", "paper"))
     exposure_ms: float = limits(8.0, 1e-3, 1e5, "ms")
     rate_hz: float = limits(40_000.0, 1, 1e8, "Hz")
-    sub_poses: int = limits(17, 1, 100_000)
+    sub_poses: int = limits(17, 0, 100_000)
     margin_ticks: int = limits(256, 0, 1_000_000, "ticks")
     light: str = limits("linear", choices=("linear", "hold"))
     label: str = limits("mid", choices=("mid", "first"))
@@ -91,12 +95,51 @@ class Sensor:
     """`[sensor]`: light to charge.
 
     Args:
+        preset: a published spike camera: its effects become those to choose from, its settings the defaults.
+        map: with `vidar-map`, the sensor's own maps (.npz; see effect `sensor_map`); its path from the scene file.
         gain: spikes a tick at RGB white (1 / threshold in the paper's units); 0.4, or 0.5 for `paper`.
-        response: of the spike camera to linear red, green and blue.
+        response: of the spike camera to linear red, green and blue, where its colour is `mono`.
+        colour: `mono`, or `bayer`: each pixel sees one colour only.
+        pattern: of `bayer`, the colours of the first two pixels of the first two rows.
+        channel_gain: of `bayer`, of red, green and blue pixels, times `gain`.
     """
 
+    preset: str = limits("", choices=preset_names("spike"))
+    map: str = limits("", unit="a .npz file")
     gain: float = limits(0.4, 1e-9, 1e9, "spikes a tick at white")
     response: Vec3 = limits((0.299, 0.587, 0.114), 0, 100)
+    colour: str = limits("mono", choices=("mono", "bayer"))
+    pattern: str = limits("rggb", choices=PATTERNS)
+    channel_gain: Vec3 = limits((1.0, 1.0, 1.0), 1e-6, 1e6)
+
+    @property
+    def bayer(self) -> Bayer | None:
+        """The colours of its pixels; None where each sees all."""
+        return Bayer(self.pattern, self.channel_gain) if self.colour == "bayer" else None
+
+
+@dataclass(frozen=True, slots=True)
+class RgbCamera:
+    """`[rgb]`: the other camera.
+
+    Args:
+        preset: a published RGB camera: its effects become those to choose from.
+    """
+
+    preset: str = limits("", choices=preset_names("rgb"))
+
+
+@dataclass(frozen=True, slots=True)
+class Tolerance:
+    """`[tolerance]`: with `effects = "auto"`, how much all that is left out may change 95 % of the pixels.
+
+    Args:
+        spikes: of the count of one exposure.
+        dn: of an RGB value.
+    """
+
+    spikes: float = limits(1.0, 0, 1e9, "spikes an exposure")
+    dn: float = limits(1.0, 0, 1e9, "digital numbers of 255")
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,11 +160,21 @@ class Settings:
     sensor: Sensor
     cloud: Cloud
     effects: tuple[Effect, ...]
+    rgb: RgbCamera = RgbCamera()
+    tolerance: Tolerance | None = None
+    events: EventCamera | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class SceneSpec:
-    """A whole scene file."""
+    """A whole scene file.
+
+    Args:
+        effects: in the order in which they act: those to simulate, or with a tolerance those to choose from.
+        tolerance: of `effects = "auto"`; None once the effects are chosen, or were listed.
+        events: an event camera in the spike camera's place; None without.
+        others: as in the file.
+    """
 
     name: str
     seed: int
@@ -133,15 +186,22 @@ class SceneSpec:
     cloud: Cloud
     world: World
     effects: tuple[Effect, ...]
+    rgb: RgbCamera = RgbCamera()
+    tolerance: Tolerance | None = None
+    events: EventCamera | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class _Top:
     name: str = limits("")
     seed: int = limits(0, 0, 2**32 - 1)
-    effects: Any = limits(())
+    effects: Any = limits(None)
+    consider: Any = limits(())
+    tolerance: Any = limits({})
     exposure: Any = limits({})
     sensor: Any = limits({})
+    rgb: Any = limits({})
+    events: Any = limits(None)
     points: Any = limits({})
 
 
@@ -166,6 +226,11 @@ def load_scene_toml(path_or_name: str | Path) -> SceneSpec:
     Raises:
         UsageError: no such file or name, not TOML, unknown keys, wrong types, values out of range: all told at once.
     """
+    return read_scene(scene_table(path_or_name), str(path_or_name))
+
+
+def scene_table(path_or_name: str | Path) -> dict[str, Any]:
+    """What a scene file (or a built-in scene's) holds, not looked at yet; faults as `load_scene_toml`."""
     text_name = str(path_or_name)
     if text_name in builtin_names():
         text = files("spikerig.rigctl.sim").joinpath(f"scenes/{text_name}.toml").read_text(encoding="utf-8")
@@ -180,10 +245,9 @@ def load_scene_toml(path_or_name: str | Path) -> SceneSpec:
                 cause="" if text_name.endswith(".toml") else nearest(text_name, builtin_names()),
             ) from None
     try:
-        table = tomllib.loads(text)
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise UsageError("the scene file is not valid TOML", value=f"{text_name}: {error}") from None
-    return read_scene(table, text_name)
 
 
 def read_settings(table: Mapping[str, Any], source: str) -> Settings:
@@ -196,14 +260,48 @@ def read_settings(table: Mapping[str, Any], source: str) -> Settings:
 
 def _settings(top: _Top, faults: Faults) -> Settings:
     paper = isinstance(top.exposure, Mapping) and top.exposure.get("protocol") == "paper"
-    exposure = read_record(Exposure, top.exposure, "exposure", faults, PAPER if paper else None)
-    sensor = read_record(Sensor, top.sensor, "sensor", faults, {"gain": 0.5} if paper else None)
+    follow = {"sub_poses": 0} if top.effects == "auto" else None  # light samples as the motion asks
+    exposure = read_record(Exposure, top.exposure, "exposure", faults, PAPER if paper else follow)
+    sensor = read_record(Sensor, top.sensor, "sensor", faults, _sensor_defaults(top.sensor, paper))
+    rgb = read_record(RgbCamera, top.rgb, "rgb", faults)
     cloud = read_record(Cloud, top.points, "points", faults)
-    effects = read_effects(top.effects, exposure.phase, faults)
+    tolerance = read_record(Tolerance, top.tolerance, "tolerance", faults)
+    effects = _effects(top, preset_effects(sensor.preset, rgb.preset, map=sensor.map), exposure.phase, faults)
+    if (sensor.preset == "vidar-map") != bool(sensor.map):
+        faults.add("sensor.map", f"is '{sensor.map}', preset '{sensor.preset}': a map and preset vidar-map go together")
     _check_exposure(exposure, faults)
     if sum(sensor.response) <= 0:
         faults.add("sensor.response", "is all zero: the spike camera would be blind")
-    return Settings(top.name, top.seed, exposure, sensor, cloud, effects)
+    for name in ("pattern", "channel_gain") if sensor.colour == "mono" else ():
+        if isinstance(top.sensor, Mapping) and name in top.sensor:
+            faults.add(f"sensor.{name}", 'is for colour = "bayer"; this sensor sees gray')
+    auto = tolerance if top.effects == "auto" else None
+    events = None if top.events is None else read_record(EventCamera, top.events, "events", faults)
+    return Settings(top.name, top.seed, exposure, sensor, cloud, effects, rgb, auto, events)
+
+
+def _sensor_defaults(table: Any, paper: bool) -> Mapping[str, Any]:
+    name = table.get("preset") if isinstance(table, Mapping) else None
+    preset = PRESETS[name].settings if isinstance(name, str) and name in PRESETS else {}
+    return {**({"gain": 0.5} if paper else {}), **preset}
+
+
+def _effects(top: _Top, presets: list[Mapping[str, Any]], phase: str, faults: Faults) -> tuple[Effect, ...]:
+    """Those listed; or, of the words `auto` and `all` (and of a preset alone), those considered: what differs from the
+    preset's parameters is said in `consider`."""
+    if top.effects in ("auto", "all") or (top.effects is None and presets):
+        found = {**read_effects(presets, faults, "preset"), **read_effects(top.consider, faults, "consider")}
+        if top.effects == "auto" and not found and not (top.consider or presets):
+            faults.add("effects", 'is "auto" with nothing to choose from; name a sensor.preset, or list `consider`')
+    else:
+        if top.consider not in ((), []):
+            faults.add("consider", 'is for effects = "auto" or "all"; list the effects wanted in one place')
+        found = read_effects(top.effects if top.effects is not None else (), faults)
+    if "initial_phase" in found and phase == "zero":
+        faults.add("effects", "list initial_phase, but exposure.phase is zero: these contradict each other")
+    if phase == "random" and "initial_phase" not in found:
+        found["initial_phase"] = effect_class("initial_phase")()
+    return in_order(settled(found, Path(faults.source).parent, faults))
 
 
 def _check_exposure(exposure: Exposure, faults: Faults) -> None:
@@ -231,6 +329,9 @@ def read_scene(table: Mapping[str, Any], source: str = "the scene") -> SceneSpec
         cloud=settings.cloud,
         world=read_world(top.world, faults),
         effects=settings.effects,
+        rgb=settings.rgb,
+        tolerance=settings.tolerance,
+        events=settings.events,
     )
     if not faults.found:
         _check_views(spec, faults)
@@ -245,6 +346,11 @@ def _check_views(spec: SceneSpec, faults: Faults) -> None:
         faults.add("exposure.sub_poses", f"is {n}, more than fit the {spec.exposure.ticks} ticks of an exposure")
     if spec.shake.path_px[0] > spec.shake.path_px[1]:
         faults.add("shake.path_px", f"is {list(spec.shake.path_px)}, expected [low, high]")
+    rolling: Any = next((e for e in spec.effects if e.name == "rolling_shutter"), None)
+    if rolling is not None and (
+        trouble := rolling.beyond(spec.lens.height, spec.exposure.margin_ticks, spec.exposure.tick_ns)
+    ):
+        faults.add("exposure.margin_ticks", trouble)
     for k in orbit.test:
         if k != int(k) or k >= orbit.views:
             faults.add("orbit.test", f"holds {k:g}, expected view numbers 0 to {orbit.views - 1}")

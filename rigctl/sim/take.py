@@ -6,25 +6,32 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from math import fsum
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spikerig.dataset.bayer import bayer_info
 from spikerig.dataset.clocktime import ClockModel
-from spikerig.dataset.errors import HostError
+from spikerig.dataset.errors import HostError, UsageError
 from spikerig.dataset.kernels import count
 from spikerig.dataset.scene import Camera, Frame, Points, Pose, Trajectory, Truth, View
 from spikerig.rigctl.sim.draws import stream
-from spikerig.rigctl.sim.effects import Effect, parameters
+from spikerig.rigctl.sim.effects import Effect, Site, parameters
+from spikerig.rigctl.sim.effects import Stage as EffectStage
+from spikerig.rigctl.sim.rgb import encode
 from spikerig.rigctl.sim.schedule import Schedule, Track, phase_ns, start_ns
-from spikerig.rigctl.sim.sensor import Light, encode
+from spikerig.rigctl.sim.sensor import Light
 from spikerig.rigctl.sim.simulate import simulate
 from spikerig.rigctl.sim.spec import Cloud, Exposure, Sensor
+
+if TYPE_CHECKING:
+    from spikerig.dataset.events import EventStream
+    from spikerig.rigctl.sim.events import EventCamera
 
 T = TypeVar("T")
 
@@ -36,7 +43,7 @@ class Rig:
     Args:
         name, seed: of the scene.
         camera: the one pinhole of both sensors.
-        exposure, sensor, effects: as in the scene file.
+        exposure, sensor, effects, events: as in the scene file.
     """
 
     name: str
@@ -45,11 +52,18 @@ class Rig:
     exposure: Exposure
     sensor: Sensor
     effects: tuple[Effect, ...]
+    events: EventCamera | None = None
 
     @property
     def light_gain(self) -> float:
-        """Spikes a tick at RGB white."""
-        return self.sensor.gain * fsum(self.sensor.response)
+        """Spikes a tick at RGB white; of a colour sensor where its channel gain is 1."""
+        return self.sensor.gain * (1.0 if self.sensor.bayer else fsum(self.sensor.response))
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What a reader of the scene must know of the cameras beside what its format says, for its info."""
+        bayer, events = self.sensor.bayer, self.events
+        return (bayer_info(bayer) if bayer else {}) | ({"events": asdict(events)} if events else {})
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +78,7 @@ class Taken:
     blur_db: float
     spikes_mean: float
     spikes_max: int
+    events: EventStream | None = None
 
 
 NO_POINTS = Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), "simulator")
@@ -92,24 +107,32 @@ def take_blurry(
     sharp: NDArray[np.float32],
     track: Track,
     rgb: NDArray[np.float32],
+    arm: NDArray[np.float32] | None = None,
 ) -> Taken:
     """A view for training: spikes over exposure and margins, and the blurry picture.
 
     Args:
         rig, number, name, plan, sharp, track: as for `take_sharp`.
         rgb: linear light float32[K,H,W,3] at `plan.phases`.
+        arm: the same as the RGB arm sees it, where that differs.
     """
-    exposure = rig.exposure
     view, at_ns, path = _labelled(rig, number, name, plan, track, "train")
-    first = int(plan.knots[0])
-    t0_ns = start_ns(exposure, number) + round(first * exposure.tick_ns)
-    light = Light(rgb, plan.knots - first, (-first, exposure.ticks - first), exposure.rate_hz, t0_ns)
-    seen = simulate(light, rig.sensor, rig.effects, rig.seed, number)
-    error = seen.frame.pixels.astype(np.float64) - encode(sharp)
-    counts = count(seen.spikes.bits, rig.camera.width, -first, exposure.ticks - first)
+    light = light_of(rig, number, plan, rgb, arm)
+    seen = simulate(light, rig.sensor, rig.effects, rig.seed, number, rig.camera, rig.events)
+    error = seen.frame.pixels * (255 / seen.frame.full) - encode(sharp)
+    counts = count(seen.spikes.bits, rig.camera.width, *light.exposure)
     blur_db = 20 * np.log10(255 / max(float(np.sqrt(np.mean(error**2))), 1e-9))
     view = replace(view, frame=seen.frame, spikes=seen.spikes, trajectory=path)
-    return Taken(view, sharp, at_ns, path, NO_POINTS, blur_db, float(counts.mean()), int(counts.max()))
+    return Taken(view, sharp, at_ns, path, NO_POINTS, blur_db, float(counts.mean()), int(counts.max()), seen.events)
+
+
+def light_of(
+    rig: Rig, number: int, plan: Schedule, rgb: NDArray[np.float32], arm: NDArray[np.float32] | None = None
+) -> Light:
+    """The light of a view over its spikes, from pictures at `plan.phases`; see `take_blurry`."""
+    exposure, first = rig.exposure, int(plan.knots[0])
+    t0_ns = start_ns(exposure, number) + round(first * exposure.tick_ns)
+    return Light(rgb, plan.knots - first, (-first, exposure.ticks - first), exposure.rate_hz, t0_ns, arm)
 
 
 def _labelled(
@@ -144,7 +167,9 @@ def surface(rig: Rig, number: int, cloud: Cloud, share: int, view: View, depth: 
     y, x = np.divmod(picked, camera.width)
     K = camera.K
     rays = np.stack([(x + 0.5 - K[0, 2]) / K[0, 0], (y + 0.5 - K[1, 2]) / K[1, 1], np.ones(len(picked))], 1)
-    return Points((rays * z[:, None] - pose[:, 3]) @ pose[:, :3], view.frame.pixels.reshape(-1, 3)[picked], "simulator")
+    return Points(
+        (rays * z[:, None] - pose[:, 3]) @ pose[:, :3], view.frame.pixels8.reshape(-1, 3)[picked], "simulator"
+    )
 
 
 def share_of(total: int, rank: int, views: int) -> int:
@@ -191,6 +216,7 @@ def pack(
     *,
     info: Mapping[str, Any],
     points: Points | None = None,
+    views: int = 0,
     force: bool = False,
     done: Callable[[Taken], None] = lambda taken: None,
 ) -> dict[str, Any]:
@@ -202,6 +228,7 @@ def pack(
         takes: in order.
         info: provenance.
         points: instead of those of the views.
+        views: how many will come; only effects on the clock need to know.
         force: replace an existing file.
         done: called after each view is written.
 
@@ -209,25 +236,57 @@ def pack(
         What was made, JSON-ready.
 
     Raises:
-        UsageError: the file exists. HostError: the disk is full.
+        UsageError: the file exists; the spike camera's clock steps back. HostError: the disk is full.
     """
     from spikerig.dataset.store import SceneWriter
 
     effects = {effect.name: parameters(effect) for effect in rig.effects}
-    truth = Truth({}, {}, {}, ClockModel.identity(), effects, rig.seed, rig.exposure.label)
+    truth = Truth({}, {}, {}, true_clock(rig, views), effects, rig.seed, rig.exposure.label)
     told: list[Taken] = []
-    more = {"light_gain": rig.light_gain, "info": info, "truth": truth}
+    more = {"light_gain": rig.light_gain, "info": {**info, **rig.facts}, "truth": truth}
+    events = 0
     # keep=False: what a simulation left half done can be made again
     with SceneWriter(path, rig.name, rig.camera, **more, force=force, keep=False) as out:
         for taken in takes:
-            out.add(taken.view, light=taken.light, at_ns=taken.at_ns, trajectory=taken.trajectory)
-            told.append(replace(taken, view=replace(taken.view, spikes=None)))
+            truths = {"light": taken.light, "at_ns": taken.at_ns, "trajectory": taken.trajectory}
+            out.add(taken.view, **truths, events=taken.events)
+            events += len(taken.events or ())
+            told.append(replace(taken, view=replace(taken.view, spikes=None), events=None))
             done(taken)
         if points is None:
             xyz, rgb = (np.concatenate([getattr(t.points, key) for t in told]) for key in ("xyz", "rgb"))
             points = Points(xyz, rgb, "simulator")
         out.points = points if len(points.xyz) else None
-    return _report(rig, told, len(points.xyz)) | {"effects": effects}
+    told_events = {"events": events} if rig.events else {}
+    return _report(rig, told, len(points.xyz)) | {"effects": effects} | told_events
+
+
+def true_clock(rig: Rig, views: int) -> ClockModel:
+    """The exact map from the spike camera's time to the rig's: knots over each view's spikes.
+
+    They lie at start, middle and end of each exposure and at the ends of its margins, straight in between.
+
+    Raises:
+        UsageError: the clock steps back from one view to the next.
+    """
+    clocks = [effect for effect in rig.effects if effect.stage == EffectStage.CLOCK]
+    if not clocks:
+        return ClockModel.identity()
+    if views < 1:
+        raise UsageError("effects on the clock need the number of views", value=views)
+    exposure, margin = rig.exposure, rig.exposure.margin_ticks
+    ticks = np.unique([-margin, 0, exposure.ticks / 2, exposure.ticks, exposure.ticks + margin])
+    at_ns = np.array([start_ns(exposure, k) + np.rint(ticks * exposure.tick_ns) for k in range(views)]).astype(np.int64)
+    ahead = np.zeros(at_ns.shape)
+    for number, times in enumerate(at_ns):
+        t0_s = float(times[0]) * 1e-9
+        site = Site(rig.camera.height, rig.camera.width, number, rig.seed, exposure.rate_hz, t0_s)
+        for effect in clocks:
+            clock = effect.begin(site).clock_ns
+            if clock is not None:
+                ahead[number] += clock(times)
+    rig_ns = at_ns.reshape(-1)
+    return ClockModel(rig_ns + np.rint(ahead.reshape(-1)).astype(np.int64), rig_ns, np.zeros(len(rig_ns)), 0.0)
 
 
 def _report(rig: Rig, told: list[Taken], points: int) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The analytic world: a room, boxes, spheres and rectangles with procedural textures, one point lamp.
+"""The analytic world: solids with procedural textures (see `solids`), one point lamp, light from everywhere.
 
 World axes: z up, right-handed, any unit of length. All light is linear; 1.0 is display white.
 """
@@ -6,62 +6,21 @@ World axes: z up, right-handed, any unit of length. All light is linear; 1.0 is 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spikerig.rigctl.sim.grow import parts_of
 from spikerig.rigctl.sim.limits import Faults, limits, nearest, read_record
+from spikerig.rigctl.sim.parts import holds
 from spikerig.rigctl.sim.pattern import Texture
+from spikerig.rigctl.sim.solids import FAR, KINDS, Bricks, Cylinder, Plant, Rect, Room, Scatter, Solid, Vec3, skins
+from spikerig.rigctl.sim.solids import Box as Box  # readers of a world find its plain solids here
+from spikerig.rigctl.sim.solids import Sphere as Sphere
 
-Vec3 = tuple[float, float, float]
-FAR = 1e6
 MAX_SOLIDS = 5000
-
-
-@dataclass(frozen=True, slots=True)
-class Room:
-    """The inside of an axis-aligned box; cameras stand in it. Coordinates of its textures are world coordinates."""
-
-    lo: Vec3 = limits(lo=-FAR, hi=FAR, unit="world units")
-    hi: Vec3 = limits(lo=-FAR, hi=FAR, unit="world units")
-    floor: Any = limits({})
-    ceiling: Any = limits({})
-    walls: Any = limits({})
-
-
-@dataclass(frozen=True, slots=True)
-class Box:
-    """A box turned about the vertical."""
-
-    centre: Vec3 = limits(lo=-FAR, hi=FAR, unit="world units")
-    size: Vec3 = limits(lo=1e-6, hi=FAR, unit="world units")
-    yaw_deg: float = limits(0.0, -360, 360, "degrees")
-    texture: Any = limits({})
-
-
-@dataclass(frozen=True, slots=True)
-class Sphere:
-    """A ball; texture coordinates are azimuth and latitude times the radius."""
-
-    centre: Vec3 = limits(lo=-FAR, hi=FAR, unit="world units")
-    radius: float = limits(lo=1e-6, hi=FAR, unit="world units")
-    texture: Any = limits({})
-
-
-@dataclass(frozen=True, slots=True)
-class Rect:
-    """A flat panel: centre, and two perpendicular half-edges; seen from both sides, casts no shadow."""
-
-    centre: Vec3 = limits(lo=-FAR, hi=FAR, unit="world units")
-    right: Vec3 = limits(lo=-FAR, hi=FAR, unit="world units")
-    up: Vec3 = limits(lo=-FAR, hi=FAR, unit="world units")
-    texture: Any = limits({})
-
-
-Solid = Room | Box | Sphere | Rect
-KINDS: dict[str, type] = {"room": Room, "box": Box, "sphere": Sphere, "rect": Rect}
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +30,7 @@ class Lamp:
     Args:
         position: where.
         power: light of a white surface one unit away that faces it (r, g, b); falls with the square of distance.
-        shadows: whether boxes and spheres throw shadows.
+        shadows: whether solids throw shadows.
     """
 
     position: Vec3 = limits((0.0, 0.0, 5.0), -FAR, FAR, "world units")
@@ -87,7 +46,7 @@ class World:
         solids: what is there.
         lamp: the point light.
         ambient: light that comes from everywhere (r, g, b).
-        contact: how much boxes and spheres darken the ambient light beside them, 0 to 1.
+        contact: how much solids darken the ambient light beside them, 0 to 1.
         sky: light where a ray hits nothing.
     """
 
@@ -104,7 +63,7 @@ class Air:
 
     Args:
         ambient: light that comes from everywhere (r, g, b).
-        contact: how much boxes and spheres darken the ambient light beside them, 0 to 1.
+        contact: how much solids darken the ambient light beside them, 0 to 1.
         sky: light where a ray hits nothing.
         lamp, solids: see below.
     """
@@ -140,17 +99,48 @@ def _read_solid(row: Any, where: str, faults: Faults) -> Solid | None:
         return None
     before = len(faults.found)
     raw = read_record(KINDS[kind], {k: v for k, v in row.items() if k != "kind"}, where, faults)
-    textures = {}
-    for name in ("floor", "ceiling", "walls") if kind == "room" else ("texture",):
-        textures[name] = read_record(Texture, getattr(raw, name), f"{where}.{name}", faults)
-        for key in ("luma", "chroma"):
-            pair = getattr(textures[name], key)
-            if pair[0] > pair[1]:
-                faults.add(f"{where}.{name}.{key}", f"is {list(pair)}, expected [low, high]")
+    changes: dict[str, Any] = {}
+    for name in skins(kind):
+        changes[name] = read_record(Texture, getattr(raw, name), f"{where}.{name}", faults)
+        _check_texture(changes[name], kind, getattr(raw, "shape", ""), f"{where}.{name}", faults)
+    if "palette" in KINDS[kind].__slots__:
+        changes["palette"] = _read_palette(raw.palette, f"{where}.palette", faults)
     if len(faults.found) > before:
         return None
-    values = {name: getattr(raw, name) for name in KINDS[kind].__slots__}
-    solid = KINDS[kind](**{**values, **textures})
+    solid = replace(raw, **changes)
+    _check_solid(solid, where, faults)
+    return solid
+
+
+def _check_texture(texture: Texture, kind: str, shape: str, where: str, faults: Faults) -> None:
+    for key in ("luma", "chroma"):
+        _check_pair(getattr(texture, key), f"{where}.{key}", faults)
+    flat = kind in ("rect", "plant") or shape == "rect"
+    if texture.cut != "none" and (kind == "room" or (texture.cut in ("leaf", "disc") and not flat)):
+        fits = (
+            "a room has no other side" if kind == "room" else "that is the outline of a panel; known here: mesh, grille"
+        )
+        faults.add(f"{where}.cut", f"is {texture.cut!r}; {fits}")
+
+
+def _check_pair(pair: tuple[float, float], where: str, faults: Faults) -> None:
+    if pair[0] > pair[1]:
+        faults.add(where, f"is {list(pair)}, expected [low, high]")
+
+
+def _read_palette(rows: Any, where: str, faults: Faults) -> tuple[Vec3, ...]:
+    good = isinstance(rows, list | tuple) and all(
+        isinstance(row, list | tuple) and len(row) == 3 and all(isinstance(v, int | float) and 0 <= v <= 1 for v in row)
+        for row in rows
+    )
+    if not good:
+        faults.add(where, f"is {rows!r}, expected a list of colours [r, g, b], each 0 to 1")
+        return ()
+    return tuple((float(r), float(g), float(b)) for r, g, b in rows)
+
+
+def _check_solid(solid: Solid, where: str, faults: Faults) -> None:
+    """Faults that need more than one key of a solid to see."""
     if isinstance(solid, Room) and not all(a < b for a, b in zip(solid.lo, solid.hi, strict=True)):
         faults.add(f"{where}.hi", f"is {list(solid.hi)}, expected more than lo = {list(solid.lo)} on every axis")
     if isinstance(solid, Rect):
@@ -158,19 +148,28 @@ def _read_solid(row: Any, where: str, faults: Faults) -> Solid | None:
         scale = np.linalg.norm(right) * np.linalg.norm(up)
         if scale == 0 or abs(right @ up) > 1e-6 * scale:
             faults.add(f"{where}.up", "and right must be perpendicular and not zero")
-    return solid
+    if isinstance(solid, Cylinder) and np.linalg.norm(np.subtract(solid.top, solid.base)) < 1e-6:
+        faults.add(f"{where}.top", "is where base is: a cylinder needs a length")
+    if isinstance(solid, Scatter | Bricks | Plant):
+        _check_pair(solid.shade, f"{where}.shade", faults)
+    if isinstance(solid, Bricks):
+        _check_pair(solid.layers, f"{where}.layers", faults)
+        for key in ("cells", "layers"):
+            if any(v != int(v) for v in getattr(solid, key)):
+                faults.add(f"{where}.{key}", f"is {list(getattr(solid, key))}, expected whole numbers")
+    if isinstance(solid, Plant) and solid.trunk > solid.height:
+        faults.add(f"{where}.trunk", f"is {solid.trunk:g}, more than the height, {solid.height:g}")
 
 
 def stands_in(world: World, at: NDArray[np.float64]) -> str:
     """What is wrong with a camera standing at a point: in words, empty when nothing is."""
     for k, solid in enumerate(world.solids):
-        if isinstance(solid, Room) and not (np.all(at > solid.lo) and np.all(at < solid.hi)):
-            return f"outside world.solids[{k}], the room"
-        if isinstance(solid, Sphere) and np.linalg.norm(at - solid.centre) <= solid.radius:
-            return f"inside world.solids[{k}], a sphere"
-        if isinstance(solid, Box):
-            c, s = np.cos(np.radians(solid.yaw_deg)), np.sin(np.radians(solid.yaw_deg))
-            q = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ (at - solid.centre)
-            if np.all(np.abs(q) <= np.array(solid.size) / 2):
-                return f"inside world.solids[{k}], a box"
+        if isinstance(solid, Room):
+            if not (np.all(at > solid.lo) and np.all(at < solid.hi)):
+                return f"outside world.solids[{k}], the room"
+            continue
+        for parts in parts_of(solid):
+            if holds(parts, at).any():
+                name = next(name for name, kind in KINDS.items() if isinstance(solid, kind))
+                return f"inside world.solids[{k}], a{'n' if name[0] in 'aeiou' else ''} {name}"
     return ""

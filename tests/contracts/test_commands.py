@@ -9,7 +9,7 @@ import pytest
 from spikerig.dataset import cli
 from spikerig.dataset.errors import DataError, DeviceError, HostError, NumericsError, RefusedError, RigError, UsageError
 
-HEAVY = ("torch", "cv2", "pycolmap", "usb", "serial", "h5py", "matplotlib", "OpenEXR")
+HEAVY = ("torch", "cv2", "pycolmap", "usb", "serial", "h5py", "matplotlib", "OpenEXR", "av", "mitsuba", "dask")
 
 
 def _python(code: str) -> subprocess.CompletedProcess[str]:

@@ -230,3 +230,34 @@ def test_info_and_texture_of_a_scene(run, tmp_path):
     code, _, text = run(*words, "--force")
     assert code == 2
     assert "--view" in text
+
+
+def test_a_texture_in_colour(run, tmp_path):
+    """As the scene says, as the command says, or off."""
+    from dataclasses import replace
+
+    from hard_store import full_scene
+
+    from spikerig.dataset.bayer import Bayer, demosaic
+    from spikerig.dataset.images import read_image
+    from spikerig.dataset.store import write_scene
+
+    scene = replace(full_scene(), info={"sensor": {"bayer": "gbrg", "channel_gain": [2.0, 1.0, 1.5]}})
+    write_scene(tmp_path / "s.h5", scene)
+    spikes = scene.view("v-01.x").spikes
+    gray = texture.tfp(spikes, 30, 8)
+    words = ("data", "texture", tmp_path / "s.h5", "--view", "v-01.x", "--at", 30, "--window", 8, "--force", "--json")
+    for more, want, pattern in (
+        ((), demosaic(gray, Bayer("gbrg", (2.0, 1.0, 1.5))), "gbrg"),
+        (("--bayer", "rggb"), demosaic(gray, Bayer("rggb")), "rggb"),
+        (("--bayer", "off"), gray, None),
+    ):
+        code, told, text = run(*words, *more, "-o", tmp_path / "t.npy")
+        assert code == 0, text
+        assert told["bayer"] == pattern
+        assert np.array_equal(np.load(tmp_path / "t.npy"), want.with_nan(), equal_nan=True)
+    assert run(*words, "-o", tmp_path / "t.png", "--gain", 1)[0] == 0
+    shown = read_image(tmp_path / "t.png")
+    assert shown.shape == (13, 21, 3)
+    assert not np.array_equal(shown[:, :, 0], shown[:, :, 2])
+    assert run(*words, "--bayer", "rgbg", "-o", tmp_path / "t.npy")[0] == 2

@@ -1,5 +1,7 @@
 """The native spike kernels equal their oracles, on every instruction set and for any number of threads."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -162,6 +164,71 @@ def test_a_ramp_is_evaluated_at_the_middle_of_each_tick():
     assert np.allclose(every, 0.05 * (np.arange(10) + 0.5), atol=2**-32)
 
 
+@pytest.mark.parametrize("level", [2.0**-32, 2.0**-25, 2.0**-20])
+def test_a_long_ramp_never_falls_below_zero(isa, level):
+    """Rounding a slope of nearly nothing a million times must not make light negative, which would read as bright."""
+    light, knots = np.array([[[level]], [[0.0]]], np.float32), np.array([0, 1_000_000])
+    bits, left, clipped = kernels.fire(light, knots, np.full((1, 1), 5, np.uint32), hold=False)
+    assert not bits[:500_000].any()
+    assert kernels.count(bits, 1, 0, 1_000_000) + left / 2.0**32 == pytest.approx(level * 500_000, abs=2.5e-4)
+    assert not clipped.any()
+
+
+@pytest.mark.parametrize("hold", [False, True])
+def test_fire_carries_what_is_beyond_a_spike(isa, hold):
+    knots = np.array([0, 3, 67, 100, 190])
+    light = light_rows(5, (3, 141), np.float32(2.5))
+    light[3:] *= np.float32(0.1)
+    charge = np.random.default_rng(4).integers(0, 2**34, (3, 141))
+    mine = kernels.fire(light, knots, charge, hold=hold, carry=True)
+    true = oracles.fire(light, knots, charge, hold=hold, carry=True)
+    for a, b in zip(mine, true, strict=True):
+        assert a.dtype == b.dtype
+        assert np.array_equal(a, b)
+    assert not mine[2].any()
+    put_in = oracles.fixed_light(light, knots, hold=hold).sum(0)
+    assert np.array_equal(put_in, (kernels.count(mine[0], 141, 0, 190).astype(np.int64) << 32) + mine[1] - charge)
+    assert mine[1].max() > 2**32  # some still wait
+
+
+def test_fire_carries_no_more_than_fits(isa):
+    light, knots = np.full((1, 1, 3), 2.0**18, np.float32), np.array([0, 70])
+    charge = np.array([[2**62 - 2**52, 2**62 - 1, 0]])
+    bits, left, clipped = kernels.fire(light, knots, charge, hold=True, carry=True)
+    true = oracles.fire(light, knots, charge, hold=True, carry=True)
+    assert np.array_equal(clipped, true[2])
+    assert np.array_equal(left, true[1])
+    assert clipped[0, 0] > 0
+    assert clipped[0, 2] == 0
+    assert kernels.count(bits, 3, 0, 70).tolist() == [[70, 70, 70]]
+
+
+@pytest.mark.parametrize("carry", [False, True])
+@pytest.mark.parametrize("hold", [False, True])
+@pytest.mark.parametrize("cuts", [[-5, -5, 0, 1, 63, 64, 200, 300], [-5, 150, 300], [-5, 299, 300]])
+def test_fire_in_spans_gives_the_bits_of_the_whole(isa, hold, carry, cuts):
+    light, knots = light_rows(5, (3, 141), np.float32(1.4)), np.array([-5, 0, 70, 71, 300])
+    start = np.random.default_rng(5).integers(0, 2**32, (3, 141), dtype=np.uint32)
+    whole = kernels.fire(light, knots, start, hold=hold, carry=carry)
+    charge, parts, clipped = start, [], np.zeros((3, 141))
+    for span in itertools.pairwise(cuts):
+        mine = kernels.fire(light, knots, charge, hold=hold, span=span, carry=carry)
+        true = oracles.fire(light, knots, charge, hold=hold, span=span, carry=carry)
+        assert all(np.array_equal(a, b) for a, b in zip(mine, true, strict=True))
+        parts.append(mine[0])
+        charge, clipped = mine[1], clipped + mine[2]
+    assert np.array_equal(np.concatenate(parts), whole[0])
+    assert np.array_equal(charge, whole[1])
+    assert np.allclose(clipped, whole[2], rtol=1e-14)
+
+
+def test_fire_refuses_spans_outside_the_knots():
+    light, start = np.full((1, 2, 9), 0.5, np.float32), np.zeros((2, 9), np.uint32)
+    for span in ((-1, 3), (2, 1), (0, 5)):
+        with pytest.raises(UsageError, match="span"):
+            kernels.fire(light, np.array([0, 4]), start, hold=True, span=span)
+
+
 def test_fire_needs_no_last_row_to_hold():
     light = light_rows(2, (3, 9), np.float32(0.5))
     charge = np.zeros((3, 9), np.uint32)
@@ -216,6 +283,9 @@ def test_fire_refuses_other_shapes_and_types():
         kernels.fire(light, np.array([0, 4]), np.zeros((2, 8), np.uint32), hold=False)
     with pytest.raises(UsageError):
         kernels.fire(light, np.array([0, 4]), np.zeros((2, 9), np.int64), hold=False)
+    for charge in (-1, 2**62):
+        with pytest.raises(NumericsError, match="charge"):
+            kernels.fire(light, np.array([0, 4]), np.full((2, 9), charge), hold=False, carry=True)
 
 
 def test_kernels_refuse_what_is_not_packed():

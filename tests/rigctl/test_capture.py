@@ -8,13 +8,14 @@ import pytest
 from hard_sim import small, small_table
 
 from spikerig.dataset.cli import run
-from spikerig.dataset.errors import HostError, UsageError
+from spikerig.dataset.errors import HostError, NumericsError, UsageError
 from spikerig.dataset.kernels import count
 from spikerig.dataset.scene import Scene
 from spikerig.dataset.store import open_scene, verify_scene
+from spikerig.rigctl.sim import farm
 from spikerig.rigctl.sim.capture import camera_of, capture, take_view, view_path
 from spikerig.rigctl.sim.light import Stage
-from spikerig.rigctl.sim.sensor import encode
+from spikerig.rigctl.sim.rgb import encode
 from spikerig.rigctl.sim.spec import SceneSpec
 from spikerig.rigctl.sim.take import in_parallel, share_of
 
@@ -190,12 +191,36 @@ def test_the_command(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["s.h5", "small.toml"]
 
 
-def test_a_failure_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def stop(taken: object) -> None:
+def test_an_interrupted_capture_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop() -> None:
         raise KeyboardInterrupt
 
+    out = tmp_path / "s.h5"
     with pytest.raises(KeyboardInterrupt):
-        capture(small(), tmp_path / "s.h5", done=stop)
+        capture(small(), out, done=stop)
+    assert [p.name for p in tmp_path.iterdir()] == ["s.h5.views"]
+    assert sorted(p.name for p in (tmp_path / "s.h5.views").iterdir()) == ["000000.npz", "made.json"]
+    with pytest.raises(UsageError, match="unfinished views of another run") as caught:
+        capture(small(seed=6), out)
+    assert "seed: 5 there, 6 here" in str(caught.value)
+    (tmp_path / "s.h5.partial").write_bytes(b"what a kill while sealing leaves")
+    made, steps = [], []
+    monkeypatch.setattr(farm, "take_view", lambda spec, number: made.append(number) or take_view(spec, number))
+    capture(small(), out, done=lambda: steps.append(1))
+    assert made == [1, 2, 3]
+    assert len(steps) == 4
+    assert [p.name for p in tmp_path.iterdir()] == ["s.h5"]
+    capture(small(), tmp_path / "t.h5")
+    assert (tmp_path / "t.h5").read_bytes() == out.read_bytes()
+
+
+def test_a_failure_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(spec: SceneSpec, number: int) -> None:
+        raise NumericsError("light must be finite")
+
+    monkeypatch.setattr(farm, "take_view", fail)
+    with pytest.raises(NumericsError):
+        capture(small(), tmp_path / "s.h5")
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "s.h5").write_text("something of the user's")
     with pytest.raises(UsageError):

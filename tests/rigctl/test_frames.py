@@ -5,17 +5,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenEXR
 import pytest
 from hard_sim import small
 
 from spikerig.dataset.cli import run
 from spikerig.dataset.errors import DataError, UsageError
-from spikerig.dataset.images import srgb_from_linear, write_image
+from spikerig.dataset.images import read_image, srgb_from_linear, write_image
 from spikerig.dataset.store import open_scene
 from spikerig.rigctl.sim.capture import camera_of, view_path
 from spikerig.rigctl.sim.folder import read_folder
 from spikerig.rigctl.sim.frames import capture_folder
 from spikerig.rigctl.sim.light import Stage
+from spikerig.rigctl.sim.pictures import mend
 from spikerig.rigctl.sim.points import read_points
 from spikerig.rigctl.sim.sensor import Light
 from spikerig.rigctl.sim.simulate import simulate
@@ -229,14 +231,94 @@ def test_pictures_that_cannot_be_used(tmp_path: Path) -> None:
     text = str(caught.value)
     for piece in (
         "5 faults",
-        "v0/v0_1.exr: the EXR holds NaN or infinite",
-        "v0/v0_2.exr: the EXR holds NaN or infinite",
-        "v1/v1_0.exr: 3 of 1566 values are negative, the least -0.25",
+        "v0/v0_1.exr: values that are no light (3 NaN of 1566)",
+        "v0/v0_2.exr: values that are no light (3 infinite of 1566)",
+        "v1/v1_0.exr: values that are no light (3 negative of 1566, the least -0.25)",
         "v1/v1_3.exr: is 29x17, the first picture 29x18",
         "v1/v1_4.exr: the picture is damaged",
     ):
         assert piece in text, (piece, text)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["f"]
+
+
+@pytest.mark.parametrize("how", ["zero", "clip"])
+def test_bad_values_are_mended_counted_and_reported(
+    tmp_path: Path, how: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """What is mended is as if the picture had held the mended values; the rest keeps its bits."""
+    values = {"v0_1.exr": np.nan, "v0_2.exr": np.inf, "v1_0.exr": -0.25, "v1_3.exr": -np.inf, "v2_0.exr": np.inf}
+    for folder in "ab":
+        root = tmp_path / folder
+        make(root)
+        for name, value in values.items():
+            light = read_image(root / name).copy()
+            mended = light.max() if how == "clip" and value == np.inf else 0
+            light[3, 4] = value if folder == "a" else mended
+            write_image(root / name, light, force=True)
+    words = ["--workers", "1", "--json", "--bad-values", how]
+    told = []
+    for folder in "ab":
+        assert run(["sim", "frames", str(tmp_path / folder), "-o", str(tmp_path / f"{folder}.h5"), *words]) == 0
+        out = capfd.readouterr()
+        told.append(json.loads(out.out)["bad_values"])
+        assert ("9 infinite, 3 negative" in out.err) == (folder == "a")
+    assert told[0] == {"how": how, "pictures": 5, "nan": 3, "infinite": 9, "negative": 3}
+    assert told[1] == {"how": how, "pictures": 0, "nan": 0, "infinite": 0, "negative": 0}
+    scenes = []
+    for folder in "ab":
+        with open_scene(tmp_path / f"{folder}.h5") as file:
+            scenes.append(file.read())
+    for a, b in zip(scenes[0].views, scenes[1].views, strict=True):
+        assert np.array_equal(a.frame.pixels, b.frame.pixels)
+        assert np.array_equal(file_light(scenes[0], a.name), file_light(scenes[1], b.name))
+        if a.spikes is not None and b.spikes is not None:
+            assert np.array_equal(a.spikes.bits, b.spikes.bits)
+    assert run(["sim", "frames", str(tmp_path / "a"), "-o", str(tmp_path / "c.h5"), "--bad-values", "zeros"]) == 2
+    assert "did you mean 'zero'" in capfd.readouterr().err
+
+
+def test_mending_a_picture_of_nothing_good() -> None:
+    light = np.array([np.nan, np.inf, -np.inf, -1], np.float32)
+    mended, bad = mend(light.copy(), "clip")
+    assert mended.tolist() == [0, 0, 0, 0]
+    assert bad == (1, 2, 1)
+    fine = np.array([0.0, 65504], np.float32)
+    assert mend(fine, "refuse") == (fine, (0, 0, 0))
+
+
+def test_a_layer_on_another_window(tmp_path: Path) -> None:
+    """Renders with a data window of their own, the picture in a named layer, depth as Blender names it."""
+    root = tmp_path / "f"
+    table = make(root)
+    plain = read_image(root / "v0_0.exr")
+    edges = (np.array([0, 0], np.int32), np.array([28, 17], np.int32))
+    inner = (np.array([2, 3], np.int32), np.array([28, 17], np.int32))
+    for view in table["views"]:
+        for frame in view["frames"]:
+            light = read_image(root / frame["file"])[3:, 2:]
+            layers = {f"beauty.{c}": np.ascontiguousarray(light[:, :, k]) for k, c in enumerate("RGB")}
+            channels = layers | {"R": 0 * light[:, :, 0].copy(), "Depth.Z": np.full(light.shape[:2], 2, np.float16)}
+            header = {"dataWindow": inner, "displayWindow": edges}
+            OpenEXR.File(header, channels).write(str(root / frame["file"]))
+    for view in table["views"][:2]:
+        view["depth"] = view["frames"][2]["file"]
+    save(root, {**table, "layer": "beauty"})
+    report = capture_folder(read_folder(root), tmp_path / "s.h5")
+    assert report["points"] == 50
+    with open_scene(tmp_path / "s.h5") as file:
+        scene = file.read()
+    seen = file_light(scene, "v0")
+    assert seen.shape == plain.shape
+    assert not seen[:3].any()
+    assert not seen[:, :2].any()
+    assert seen[3:, 2:].any()
+    assert scene.points is not None
+    pose = scene.views[0].pose.cam_from_world
+    z = scene.points.xyz[:25] @ pose[2, :3] + pose[2, 3]
+    assert np.allclose(z, 2, rtol=0.06), "two units ahead, within the noise of depth"
+    save(root, {**table, "layer": 3})
+    with pytest.raises(DataError, match="layer: is 3"):
+        read_folder(root)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,8 @@ import pytest
 
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.kernels import count
-from spikerig.rigctl.sim.sensor import Light, encode, expose, integrate, spike_light
+from spikerig.rigctl.sim.rgb import encode, expose, window_weights
+from spikerig.rigctl.sim.sensor import Light, delayed, integrate, refined, spike_light
 from spikerig.rigctl.sim.simulate import simulate
 from spikerig.rigctl.sim.spec import Sensor
 
@@ -18,30 +19,24 @@ def ramp(knots: list[int], exposure: tuple[int, int], pictures: int | None = Non
 
 def test_trapezoid_is_exact_for_ramps() -> None:
     light = ramp([0, 10, 13, 40, 100, 120], (10, 100))
-    assert light.weights().sum() == pytest.approx(1)
-    assert light.weights()[[0, 5]].tolist() == [0, 0]
+    weights = window_weights(light, np.array([10.0]))[0]
+    assert weights.sum() == pytest.approx(1)
+    assert weights[[0, 5]].tolist() == [0, 0]
     assert np.allclose(expose(light), 0.055)
 
 
 def test_slots_weigh_by_their_length() -> None:
     light = ramp([0, 10, 30, 40], (10, 40), 3)
     assert light.hold
-    assert np.allclose(light.weights(), [0, 2 / 3, 1 / 3])
+    assert np.allclose(window_weights(light, np.array([10.0])), [[0, 2 / 3, 1 / 3]])
 
 
 def test_light_between_knots_is_at_tick_midpoints() -> None:
     """The charge of a ramp over whole intervals is the integral, for knots and for ticks alike."""
     light = ramp([0, 64, 320], (0, 320)).rgb[..., 0]
-    seen = []
-
-    def spy(block: np.ndarray) -> None:
-        seen.append(block[:, 0, 0].copy())
-
-    from spikerig.rigctl.sim.effects import Hooks
-
     knots = np.array([0, 64, 320])
-    bits, left, _ = integrate(light.copy(), knots, np.zeros((2, 3)), [(True, Hooks(light=spy))])
-    assert np.allclose(np.concatenate(seen), (np.arange(320) + 0.5) / 1000, atol=1e-7)
+    fine = np.tile(((np.arange(320) + 0.5) / 1000).astype(np.float32)[:, None, None], (1, 2, 3))
+    bits, left, _ = integrate(fine, np.arange(321), np.zeros((2, 3)))
     whole, left_whole, _ = integrate(light.copy(), knots, np.zeros((2, 3)))
     assert count(bits, 3, 0, 320)[0, 0] == count(whole, 3, 0, 320)[0, 0] == 51  # 0.32^2 / 2 * 1000 = 51.2
     assert left[0, 0] / 2**32 == pytest.approx(0.2, abs=1e-4)
@@ -90,3 +85,45 @@ def test_times() -> None:
 def test_light_that_does_not_fit(shape: tuple, knots: list, exposure: tuple, says: str) -> None:
     with pytest.raises(UsageError, match=says):
         Light(np.zeros(shape, np.float32), np.array(knots), exposure, 1e4)
+
+
+def test_refined_light_is_the_same_light() -> None:
+    light = ramp([0, 10, 13, 40, 100, 120], (10, 100))
+    fine = refined(light, 7e-4)
+    assert np.diff(fine.knots).max() <= 7
+    assert set(light.knots.tolist()) <= set(fine.knots.tolist())
+    assert np.allclose(fine.rgb[:, 0, 0, 0], fine.knots / 1000)
+    held = refined(ramp([0, 10, 30, 40], (10, 40), 3), 7e-4)
+    assert held.hold
+    assert np.allclose(window_weights(held, np.array([10.0])).sum(), 1)
+    assert np.allclose(expose(held), expose(ramp([0, 10, 30, 40], (10, 40), 3)))
+    copy = refined(light, 0.0)
+    copy.rgb[:] = 0
+    assert light.rgb.any()
+
+
+@pytest.mark.parametrize("hold", [False, True])
+def test_a_clock_that_is_ahead_sees_the_past(hold: bool) -> None:
+    light = ramp([0, 10, 20, 40, 80], (0, 80), 4 if hold else 5)
+    seen, knots = delayed(light.rgb[..., 0], light.knots, np.full(5, 5.0))
+    if hold:  # the first picture also stands in for what came before it
+        assert knots.tolist() == [0, 5, 15, 25, 45, 80]
+        assert np.allclose(seen[:, 0, 0], [0, 0, 0.01, 0.02, 0.04])
+    else:
+        assert np.allclose(np.interp([30, 60, 80], knots, seen[:, 0, 0]), [0.025, 0.055, 0.075])
+        assert seen[0, 0, 0] == 0
+    same, _ = delayed(light.rgb[..., 0], light.knots, np.zeros(5))
+    assert np.array_equal(same, light.rgb[..., 0])
+    with pytest.raises(UsageError, match="backwards"):
+        delayed(light.rgb[..., 0], light.knots, np.array([0.0, -11.0, 0.0, 0.0, 0.0]))
+
+
+def test_rows_of_a_rolling_shutter_see_their_own_time() -> None:
+    """On a ramp in time each row's mean is the ramp at the middle of that row's exposure; row H//2 is on time."""
+    knots = np.array([0, 50, 100, 200])
+    rgb = np.tile((knots / 1000).astype(np.float32)[:, None, None, None], (1, 5, 2, 3))
+    light = Light(rgb, knots, (50, 100), 1e4)
+    rows = expose(light, row_ns=1e5 * 8)[:, 0, 0]  # eight ticks a row
+    assert np.allclose(rows, 0.075 + 0.008 * (np.arange(5) - 2))
+    with pytest.raises(UsageError, match="reads out for longer"):
+        expose(light, row_ns=1e5 * 30)

@@ -74,7 +74,7 @@ def test_all_faults_at_once() -> None:
         (["shot_noise", {"name": "shot_noise", "threshold_e": 9}], "random", "a second time"),
         (["initial_phase"], "zero", "contradict"),
         ([3], "random", "expected a name"),
-        ("auto", "random", "not offered yet"),
+        ("auto", "random", "nothing to choose from"),
         ("shot_noise", "random", "expected a list"),
     ],
 )

@@ -30,10 +30,18 @@ def changed(tiny, tmp_path, **changes):
     """The tiny scene with its first view (or the scene itself) changed; returns the new file."""
     with open_scene(tiny) as file:
         scene: Scene = file.read()
-    of_scene = {k: changes.pop(k) for k in ("clock", "light_gain", "truth") if k in changes}
+    of_scene = {k: changes.pop(k) for k in ("clock", "light_gain", "truth", "info") if k in changes}
     views = (replace(scene.views[0], **changes), *scene.views[1:]) if changes else scene.views
     write_scene(tmp_path / "changed.h5", replace(scene, views=views, **of_scene))
     return tmp_path / "changed.h5"
+
+
+def test_a_scene_of_a_colour_spike_camera_is_refused_where_gray_is_compared(tiny, tmp_path):
+    path = changed(tiny, tmp_path, info={"sensor": {"bayer": "rggb"}})
+    for method in ("spikenerf", "spike-ratio"):
+        with pytest.raises(DataError, match="see colours"):
+            targets(path, method)
+    targets(path, "oracle")
 
 
 def test_the_calibrated_converter_is_that_of_the_simulator(tiny):

@@ -7,7 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from spikerig.rigctl.sim.effects import Facts, Floats, Hooks, Site, Stage
+from spikerig.rigctl.sim.effects import Floats, Hooks, Site, Stage
+from spikerig.rigctl.sim.facts import Bound, Facts
 from spikerig.rigctl.sim.limits import limits
 
 
@@ -25,11 +26,10 @@ class DarkCurrent:
 
     name: ClassVar[str] = "dark_current"
     stage: ClassVar[Stage] = Stage.CHARGE
-    per_tick: ClassVar[bool] = False
-    unit: ClassVar[str] = "spikes an exposure"
+    per: ClassVar[str] = "knot"
     source: ClassVar[str] = "SCSim (arXiv 2304.03129): 0.47 % of the threshold a tick, sd 0.18 %"
     vanishes: ClassVar[str] = "rate = sd = 0"
-    cost_ns: ClassVar[float] = 0.4
+    cost_ns: ClassVar[float] = 1.3
 
     def begin(self, site: Site) -> Hooks:
         """The sensor's dark charge."""
@@ -43,6 +43,7 @@ class DarkCurrent:
 
         return Hooks(light=light)
 
-    def magnitude(self, facts: Facts) -> float:
-        """(rate + 3 sd) ticks."""
-        return (self.rate + 3 * self.sd) * facts.ticks
+    def magnitude(self, facts: Facts) -> Bound:
+        """(rate + sd z) ticks, z normal; no more than fit below one spike a tick."""
+        dark = np.maximum(self.rate + self.sd * facts.normal()[0], 0)
+        return Bound(facts.spikes(dark), 0.0, f"({self.rate:g} + {self.sd:g} z) x {facts.ticks}")

@@ -7,7 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from spikerig.rigctl.sim.effects import Facts, Floats, Hooks, Site, Stage
+from spikerig.rigctl.sim.effects import Floats, Hooks, Site, Stage
+from spikerig.rigctl.sim.facts import Bound, Facts
 from spikerig.rigctl.sim.limits import limits
 
 
@@ -23,11 +24,10 @@ class ThresholdFpn:
 
     name: ClassVar[str] = "threshold_fpn"
     stage: ClassVar[Stage] = Stage.CHARGE
-    per_tick: ClassVar[bool] = False
-    unit: ClassVar[str] = "spikes an exposure"
+    per: ClassVar[str] = "knot"
     source: ClassVar[str] = "SCSim (arXiv 2304.03129): 4.5 %; SpikingSIM real_spike: at most 3.7 % rms"
     vanishes: ClassVar[str] = "sd = 0"
-    cost_ns: ClassVar[float] = 0.5
+    cost_ns: ClassVar[float] = 1.2
 
     def begin(self, site: Site) -> Hooks:
         """The sensor's thresholds."""
@@ -39,6 +39,8 @@ class ThresholdFpn:
 
         return Hooks(light=light)
 
-    def magnitude(self, facts: Facts) -> float:
-        """3 sd of the brightest pixel's count."""
-        return 3 * self.sd * min(facts.light_max, 1.0) * facts.ticks
+    def magnitude(self, facts: Facts) -> Bound:
+        """sd z of the count, z normal."""
+        threshold = np.maximum(1 + self.sd * facts.normal()[0], 0.1)
+        counts = facts.most(facts.counts)
+        return Bound(facts.spikes(lambda light: light / threshold), 0.0, f"{self.sd:g} z x {counts:.3g} spikes")

@@ -8,7 +8,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.rigctl.sim.effects import Facts, Hooks, Site, Stage
+from spikerig.rigctl.sim.effects import Hooks, Site, Stage
+from spikerig.rigctl.sim.facts import Bound, Facts
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,11 +18,10 @@ class InitialPhase:
 
     name: ClassVar[str] = "initial_phase"
     stage: ClassVar[Stage] = Stage.CHARGE
-    per_tick: ClassVar[bool] = False
-    unit: ClassVar[str] = "spikes an exposure"
+    per: ClassVar[str] = "frame"
     source: ClassVar[str] = "SpikeCV video_to_spike: U(0, threshold)"
     vanishes: ClassVar[str] = "left out, or exposure.phase = zero: the paper's zero charge"
-    cost_ns: ClassVar[float] = 0.0
+    cost_ns: ClassVar[float] = 26.0
 
     def begin(self, site: Site) -> Hooks:
         """Charges of one view."""
@@ -32,6 +32,6 @@ class InitialPhase:
 
         return Hooks(charge=charge)
 
-    def magnitude(self, facts: Facts) -> float:
-        """At most one spike sooner."""
-        return 1.0
+    def magnitude(self, facts: Facts) -> Bound:
+        """Each pixel's phase at both ends of the exposure: one spike more or less."""
+        return Bound(1.0 if facts.counts.any() else 0.0, 0.0, "one spike")

@@ -7,7 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from spikerig.rigctl.sim.effects import Facts, Floats, Hooks, Site, Stage
+from spikerig.rigctl.sim.effects import Floats, Hooks, Site, Stage
+from spikerig.rigctl.sim.facts import Bound, Facts
 from spikerig.rigctl.sim.limits import limits
 
 
@@ -23,8 +24,7 @@ class ReadNoise:
 
     name: ClassVar[str] = "read_noise"
     stage: ClassVar[Stage] = Stage.RGB
-    per_tick: ClassVar[bool] = False
-    unit: ClassVar[str] = "digital numbers of 255"
+    per: ClassVar[str] = "frame"
     source: ClassVar[str] = "the sensor of the feasibility study: one digital number"
     vanishes: ClassVar[str] = "sd = 0"
     cost_ns: ClassVar[float] = 20.0
@@ -38,6 +38,6 @@ class ReadNoise:
 
         return Hooks(encoded=encoded)
 
-    def magnitude(self, facts: Facts) -> float:
-        """Three standard deviations."""
-        return 3 * 255 * self.sd
+    def magnitude(self, facts: Facts) -> Bound:
+        """255 sd z, z normal."""
+        return Bound(0.0, facts.counted(255 * self.sd * facts.normal()[0]), f"255 x {self.sd:g} z")

@@ -1,0 +1,238 @@
+"""COLMAP, in a process of its own: `python -m spikerig.calib.colmap_child JOB.json`; only this imports pycolmap.
+
+Its wheel exports a static zlib (after it is imported first, PNG writing aborts) and ends the process when asked for a
+feature type it was built without. So the parent never imports it: a job comes as JSON, a result goes back as JSON and
+.npy, and a crash is one clear error in the parent.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+import zlib  # noqa: F401  the system's zlib must be loaded before pycolmap's
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+COVISIBLE = 4  # mapped views that a further instant is matched against
+
+
+def main(path: str) -> None:
+    """Do one job: features, matches, a map of some images, and the others placed in it."""
+    import pycolmap
+
+    job = json.loads(Path(path).read_text(encoding="utf-8"))
+    root = Path(path).parent
+    pycolmap.logging.minloglevel = 3
+    pycolmap.set_random_seed(job["seed"])
+    told: dict[str, Any] = {"version": pycolmap.__version__, "seconds": {}}
+    began = time.monotonic()
+
+    def lap(name: str) -> None:
+        nonlocal began
+        now = time.monotonic()
+        told["seconds"][name] = told["seconds"].get(name, 0.0) + now - began
+        began = now
+        print(json.dumps({"done": name}), flush=True)
+
+    database = root / "database.db"
+    _extract(job, root, database, job["map"] + job["place"])
+    if job.get("rig"):
+        _rig(job, database)
+    lap("features")
+    _match(job, root, database, job["pairs"])
+    lap("matches")
+    models = _map(job, root, database)
+    told["models"] = sorted((m.num_reg_images() for m in models), reverse=True)
+    lap("mapping")
+    if models:
+        best = max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()))
+        told |= _model(best, root)
+        sparse = root / "sparse"
+        sparse.mkdir(exist_ok=True)
+        best.write_text(str(sparse))
+        if job["place"]:
+            told["placed"] = _place(job, root, database, best)
+            lap("localising")
+    (root / "result.json").write_text(json.dumps(told), encoding="utf-8")
+
+
+def _extract(job: dict[str, Any], root: Path, database: Path, names: list[str]) -> None:
+    import pycolmap
+
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = job["threads"]
+    options.max_image_size = job.get("max_image_size", -1)
+    options.sift.peak_threshold = job["peak_threshold"]
+    options.sift.max_num_features = job["max_features"]
+    reader = pycolmap.ImageReaderOptions()
+    mode = pycolmap.CameraMode.SINGLE
+    if job["camera"]:
+        reader.camera_model = job["camera"]["model"]
+        reader.camera_params = ",".join(repr(float(v)) for v in job["camera"]["params"])
+    if job.get("rig"):
+        mode = pycolmap.CameraMode.PER_FOLDER
+    elif job.get("separate_cameras"):
+        mode = pycolmap.CameraMode.PER_IMAGE
+    pycolmap.extract_features(
+        database,
+        root / "images",
+        image_names=names,
+        camera_mode=mode,
+        reader_options=reader,
+        extraction_options=options,
+    )
+
+
+def _rig(job: dict[str, Any], database: Path) -> None:
+    """Two arms behind one splitter: images of the same name are one frame, their relative pose is fixed."""
+    import pycolmap
+
+    config = Path(database).with_name("rig.json")
+    config.write_text(json.dumps(job["rig"]), encoding="utf-8")
+    opened = pycolmap.Database.open(database)
+    pycolmap.apply_rig_config(pycolmap.read_rig_config(config), opened)
+    opened.close()
+
+
+def _match(job: dict[str, Any], root: Path, database: Path, pairs: Any) -> None:
+    import pycolmap
+
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.num_threads = job["threads"]
+    matching.sift.max_ratio = job["max_ratio"]
+    matching.skip_image_pairs_in_same_frame = True
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = job["seed"]
+    verification.ransac.max_error = job["max_error_px"]
+    options = {"matching_options": matching, "verification_options": verification}
+    if pairs == "exhaustive":
+        pycolmap.match_exhaustive(database, **options)
+    elif pairs == "sequential":
+        pairing = pycolmap.SequentialPairingOptions(overlap=job["overlap"])
+        pycolmap.match_sequential(database, pairing_options=pairing, **options)
+    else:
+        listed = root / "pairs.txt"
+        listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
+        pairing = pycolmap.ImportedPairingOptions(match_list_path=str(listed))
+        pycolmap.match_image_pairs(database, pairing_options=pairing, **options)
+
+
+def _map(job: dict[str, Any], root: Path, database: Path) -> list[Any]:
+    import pycolmap
+
+    out = root / "models"
+    out.mkdir(exist_ok=True)
+    known = bool(job["camera"])
+    if job["mapper"] == "global":
+        options = pycolmap.GlobalPipelineOptions()
+        options.image_names = job["map"]
+        options.random_seed = job["seed"]
+        if known:
+            adjust = options.mapper.bundle_adjustment
+            adjust.refine_focal_length = adjust.refine_principal_point = adjust.refine_extra_params = False
+        return list(pycolmap.global_mapping(database, root / "images", out, options).values())
+    options = pycolmap.IncrementalPipelineOptions()
+    options.image_names = job["map"]
+    options.num_threads = options.mapper.num_threads = 1  # two threads give two answers
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = job["seed"]
+    options.min_model_size = 3
+    options.ba_refine_focal_length = options.ba_refine_extra_params = not known
+    options.ba_refine_sensor_from_rig = False
+    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = not known
+    if known:  # small pictures of known cameras: what is off by more is wrong
+        options.mapper.filter_max_reproj_error = job["max_error_px"]
+        options.triangulation.merge_max_reproj_error = job["max_error_px"]
+        options.triangulation.complete_max_reproj_error = job["max_error_px"]
+        options.mapper.init_min_tri_angle = 8.0
+        options.mapper.init_min_num_inliers = 40
+    return list(pycolmap.incremental_mapping(database, root / "images", out, options).values())
+
+
+def _model(model: Any, root: Path) -> dict[str, Any]:
+    """Poses, points and residuals of a model, JSON-ready; points and their residuals as .npy beside."""
+    images = {}
+    for image in model.images.values():
+        if image.has_pose:
+            seen = sum(1 for p in image.points2D if p.has_point3D())
+            pose = np.asarray(image.cam_from_world().matrix())
+            images[image.name] = {"pose": pose.tolist(), "points": seen}
+    points = list(model.points3D.values())
+    np.save(root / "xyz.npy", np.array([p.xyz for p in points], np.float64).reshape(-1, 3))
+    np.save(root / "rgb.npy", np.array([p.color for p in points], np.uint8).reshape(-1, 3))
+    np.save(root / "error.npy", np.array([p.error for p in points], np.float64))
+    cameras = {}
+    for key, camera in model.cameras.items():
+        cameras[str(key)] = {
+            "model": camera.model.name,
+            "params": [float(v) for v in camera.params],
+            "size": [camera.width, camera.height],
+        }
+    return {
+        "images": images,
+        "points": len(points),
+        "error_px": float(model.compute_mean_reprojection_error()),
+        "track_length": float(model.compute_mean_track_length()),
+        "cameras": cameras,
+    }
+
+
+def _place(job: dict[str, Any], root: Path, database: Path, model: Any) -> dict[str, Any]:
+    """Further instants: matched against the map's nearest images of other views, then solved one by one."""
+    import pycolmap
+
+    mapped = {i.name: i for i in model.images.values() if i.has_pose}
+    near = _neighbours(model, mapped)
+    own = job["own"]
+    pairs = [(name, other) for name in job["place"] for other in near.get(own[name], [])]
+    _match(job, root, database, pairs)
+    opened = pycolmap.Database.open(database)
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.max_error = 2 * job["max_error_px"]
+    options.ransac.random_seed = job["seed"]
+    placed = {}
+    for name in job["place"]:
+        image: Any = opened.read_image_with_name(name)
+        keys = np.asarray(opened.read_keypoints(image.image_id), np.float64)[:, :2]
+        found: dict[tuple[int, int], None] = {}
+        for other in near.get(own[name], []):
+            there = mapped[other]
+            geometry = opened.read_two_view_geometry(image.image_id, there.image_id)
+            for a, b in np.asarray(geometry.inlier_matches).reshape(-1, 2):
+                point = there.points2D[int(b)]
+                if point.has_point3D():
+                    found[int(a), int(point.point3D_id)] = None
+        rows = list(found)
+        if len(rows) < 8:
+            continue
+        xy = keys[[a for a, _ in rows]]
+        xyz = np.array([model.points3D[p].xyz for _, p in rows])
+        camera = model.cameras[image.camera_id]
+        solved = pycolmap.estimate_and_refine_absolute_pose(
+            xy, xyz, camera, estimation_options=options, return_covariance=True
+        )
+        if solved is None or solved["num_inliers"] < 8:
+            continue
+        placed[name] = {
+            "pose": np.asarray(solved["cam_from_world"].matrix()).tolist(),
+            "inliers": int(solved["num_inliers"]),
+            "cov": np.asarray(solved["covariance"]).tolist(),
+        }
+    opened.close()
+    return placed
+
+
+def _neighbours(model: Any, mapped: dict[str, Any]) -> dict[str, list[str]]:
+    """The images that see most of the same points, for each image."""
+    seen = {n: {p.point3D_id for p in i.points2D if p.has_point3D()} for n, i in mapped.items()}
+    near = {}
+    for name, points in seen.items():
+        shared = sorted(((len(points & seen[o]), o) for o in seen if o != name), reverse=True)
+        near[name] = [o for n, o in shared[:COVISIBLE] if n > 0]
+    return near
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

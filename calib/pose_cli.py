@@ -1,0 +1,201 @@
+"""`spikerig calib poses`: camera poses from spike textures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from spikerig.dataset.errors import RefusedError, UsageError
+from spikerig.dataset.terminal import Progress, emit, note
+
+
+def poses(
+    source: Annotated[Path, typer.Argument(help="A scene file, or a folder of pictures.")],
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for poses.json and COLMAP's model.")] = None,
+    write: Annotated[bool, typer.Option("--write", help="Put the poses into the scene, in place.")] = False,
+    write_to: Annotated[Path | None, typer.Option(help="Put the poses into a copy of the scene.")] = None,
+    arms: Annotated[str, typer.Option(help="spike, rgb, or both (a rig of fixed relative pose).")] = "spike",
+    kinds: Annotated[str, typer.Option(help="Textures, e.g. tfp96,adaptive; default: by sharpness and noise.")] = "",
+    maps: Annotated[int, typer.Option(help="Kinds mapped independently; they must agree.")] = 3,
+    instants: Annotated[int, typer.Option(help="Poses over each exposure; 1: the middle alone.")] = 5,
+    min_share: Annotated[float, typer.Option(help="Of the views that must be placed.")] = 0.8,
+    max_error_px: Annotated[float, typer.Option(help="Of a match and of an observation.")] = 1.5,
+    pairs: Annotated[str, typer.Option(help="auto, exhaustive or sequential.")] = "auto",
+    mapper: Annotated[str, typer.Option(help="incremental or global.")] = "incremental",
+    peak_threshold: Annotated[float, typer.Option(help="Of SIFT; lower finds more in low contrast.")] = 0.0033,
+    max_features: Annotated[int, typer.Option(help="A picture.")] = 4096,
+    max_image_size: Annotated[int, typer.Option(help="Longer sides are made smaller; -1: never.")] = -1,
+    shared_camera: Annotated[bool, typer.Option(help="A folder's pictures are of one camera.")] = False,
+    seed: Annotated[int, typer.Option(help="Of RANSAC and of the mapper.")] = 1,
+    threads: Annotated[int, typer.Option(help="Of features and matches; 0: one a core.")] = 0,
+    force: Annotated[bool, typer.Option("--force", help="Replace earlier results; keep refused ones.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
+) -> None:
+    """Estimate camera poses by COLMAP on sharp spike textures; several kinds are mapped, and must agree.
+
+    A poor result is refused (exit 4) and not written, unless --force says so, which is recorded.
+    """
+    from spikerig.calib.mapping import Options
+    from spikerig.calib.poses import Wanted
+
+    options = Options(
+        peak_threshold, max_features, pairs=pairs, mapper=mapper, seed=seed, threads=threads,
+        max_error_px=max_error_px, max_image_size=max_image_size,
+    )  # fmt: skip
+    if out is not None and (out / "poses.json").exists() and not force:
+        raise UsageError("there is an earlier result", value=out / "poses.json", next="give --force to replace it")
+    if source.is_dir():
+        if write or write_to:
+            raise UsageError("--write is for scene files", value=source)
+        told = _folder(source, out, options, shared_camera, min_share)
+    else:
+        if write and write_to:
+            raise UsageError("give --write or --write-to, not both")
+        listed = tuple(k for k in kinds.split(",") if k)
+        wanted = Wanted(arms, listed, min(maps, len(listed)) if listed else maps, instants, min_share, max_error_px)
+        told = _scene(source, out, wanted, options, write, write_to, force)
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "poses.json").write_text(json.dumps(told, indent=1), encoding="utf-8")
+    refused = None
+    if not told["accepted"] and not force:
+        refused = RefusedError(
+            "these poses are not good enough to keep",
+            value="; ".join(told["reasons"]),
+            cause="too little overlap or texture, too much blur, or too short a baseline",
+            next="try --peak-threshold 0.0015, other --kinds, or capture more views; --force keeps them, and says so",
+        )
+    _tell(told)
+    if as_json:
+        emit("spikerig.calib.poses/1", told | ({"error": refused.as_json()} if refused else {}))
+        raise typer.Exit(refused.exit_code if refused else 0)
+    if refused:
+        raise refused
+
+
+def _scene(
+    source: Path, out: Path | None, wanted: Any, options: Any, write: bool, write_to: Path | None, force: bool
+) -> dict[str, Any]:
+    from spikerig.calib.posed_scene import write_poses
+    from spikerig.calib.poses import estimate_poses
+    from spikerig.dataset.store import open_scene
+
+    with open_scene(source) as scene:
+        views = [scene.view(n) for n in scene.names]
+        views = [v for v in views if v.spikes is not None or (wanted.arms == "rgb" and v.split == "train")]
+        bar = Progress("mapping", 0, "steps")
+        keep = None if out is None else out / "colmap"
+        estimate = estimate_poses(views, scene.camera, wanted, options, keep=keep, done=lambda step: bar.step(1, step))
+        known = {v.name: v.pose.cam_from_world for v in views}
+        simulated = scene.has_truth and "poses" not in scene.info
+    told = report(estimate, options)
+    told["source"] = str(source)
+    told["truth"] = against(estimate, known) if simulated else None
+    told["forced"] = bool(estimate.reasons) and force
+    if (write or write_to) and (told["accepted"] or force):
+        left_out = ("poses", "source", "seconds")
+        record = {k: v for k, v in told.items() if k not in left_out}
+        told |= write_poses(source, estimate, record, out=write_to, force=force)
+    return told
+
+
+def _folder(source: Path, out: Path | None, options: Any, shared: bool, min_share: float) -> dict[str, Any]:
+    from dataclasses import replace
+
+    from spikerig.calib.mapping import build_map
+    from spikerig.calib.poses import Estimate
+
+    files = sorted(p for p in source.iterdir() if p.suffix.lower() in (".png", ".jpg", ".jpeg"))
+    if not files:
+        raise UsageError("no pictures in this folder", value=source, expected=".png, .jpg")
+    stems = [p.stem for p in files]
+    double = sorted({s for s in stems if stems.count(s) > 1})
+    if double:
+        raise UsageError("two pictures have the same stem", value=", ".join(double[:5]))
+    bar = Progress("mapping", 0, "steps")
+    keep = None if out is None else out / "colmap"
+    pictures = {p.stem: p for p in files}
+    tuned = replace(options, max_error_px=max(options.max_error_px, 4.0))  # COLMAP's own, for pictures of any size
+    more = {"separate_cameras": not shared, "keep": keep}
+    found = build_map(pictures, None, tuned, **more, done=lambda step: bar.step(1, step))
+    poses = {n: p.pose for n, p in found.poses.items()}
+    reasons = ()
+    if len(poses) < max(3, min_share * len(files)):
+        lost = ", ".join(sorted(set(stems) - poses.keys())[:12])
+        reasons = (f"only {len(poses)} of {len(files)} pictures were placed ({min_share:.0%} asked for); not: {lost}",)
+    told = report(Estimate(tuple(stems), poses, {}, found, ("pictures",), reasons=reasons), tuned)
+    return told | {"source": str(source), "truth": None, "forced": False}
+
+
+def report(estimate: Any, options: Any) -> dict[str, Any]:
+    """An estimate, JSON-ready."""
+    from dataclasses import asdict
+
+    best = estimate.best
+    inliers = {n: p.inliers for n, p in best.poses.items()}
+    return {
+        "accepted": not estimate.reasons,
+        "reasons": list(estimate.reasons),
+        "registered": len(estimate.poses),
+        "images": len(estimate.images),
+        "not_registered": sorted(set(estimate.images) - estimate.poses.keys()),
+        "models": list(best.models),
+        "error_px": None if best.error_px != best.error_px else best.error_px,
+        "points": len(best.xyz),
+        "kinds": list(estimate.kinds),
+        "textures": [{"kind": k.kind, "sharpness": k.sharpness, "noise": k.noise} for k in estimate.looked],
+        "agreement": {
+            "maps": estimate.agreeing[1],
+            "agree": estimate.agreeing[0],
+            "deg": estimate.agreement_deg,
+            "share_of_extent": estimate.agreement_share,
+        },
+        "paths": len(estimate.paths),
+        "path_chi2": {n: p.chi2 for n, p in sorted(estimate.paths.items())},
+        "observations": dict(sorted(inliers.items())),
+        "poses": {n: p.tolist() for n, p in sorted(estimate.poses.items())},
+        "options": asdict(options),
+        "versions": {"pycolmap": best.version},
+        "seconds": dict(estimate.seconds or best.seconds),
+    }
+
+
+def against(estimate: Any, known: dict[str, Any]) -> dict[str, Any] | None:
+    """Errors against known poses, after the best similarity: median and largest degrees, and share of the extent."""
+    import numpy as np
+
+    from spikerig.calib.gauge import pose_errors
+    from spikerig.dataset.errors import DataError
+
+    shared = sorted(estimate.poses.keys() & known.keys())
+    try:
+        turned, moved = pose_errors(*(np.stack([m[n] for n in shared]) for m in (estimate.poses, known)))
+    except (DataError, ValueError):
+        return None
+    within = int(np.sum((turned <= 1) & (moved <= 0.02)))
+    return {
+        "deg": {"median": float(np.median(turned)), "max": float(turned.max())},
+        "share_of_extent": {"median": float(np.median(moved)), "max": float(moved.max())},
+        "within_1deg_2percent": within,
+    }
+
+
+def _tell(told: dict[str, Any]) -> None:
+    error = "" if told["error_px"] is None else f", residual {told['error_px']:.2f} px, {told['points']} points"
+    note(f"{told['registered']} of {told['images']} views placed{error}; textures: {', '.join(told['kinds'])}")
+    agreement = told["agreement"]
+    if agreement["deg"] is not None:
+        note(
+            f"{agreement['agree']} of {agreement['maps']} maps agree, within {agreement['deg']:.2f} degrees and "
+            f"{100 * agreement['share_of_extent']:.2f} % of the extent (medians)"
+        )
+    if told["truth"]:
+        deg, share = told["truth"]["deg"], told["truth"]["share_of_extent"]
+        note(f"against truth: {deg['median']:.2f} degrees, {100 * share['median']:.2f} % of the extent (medians)")
+    for name in told["not_registered"][:20]:
+        note(f"not placed: {name}")
+    if told.get("written"):
+        note(f"{told['written']}: poses written{' although refused' if told['forced'] else ''}")

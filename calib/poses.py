@@ -1,0 +1,321 @@
+"""Camera poses of a scene from its spikes: sharp textures are mapped by COLMAP, several ways, and must agree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spikerig.calib.consensus import Path, agree, apart_by, averaged, paths_through
+from spikerig.calib.gauge import centres, extent
+from spikerig.calib.mapping import Map, Options, build_map
+from spikerig.calib.pictures import KINDS, Looks, looks, picture_of, texture_of
+from spikerig.dataset.errors import UsageError
+from spikerig.dataset.scene import Camera, View
+
+Floats = NDArray[np.float64]
+LOOKED_AT = 6  # views on which the kinds of texture are judged
+HARDER = Options(peak_threshold=0.0015, max_ratio=0.85)
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What to estimate, and what is good enough.
+
+    Args:
+        arms: pictures of the `spike` arm, of `rgb`, or of `both` as a COLMAP rig of fixed relative pose.
+        kinds: of texture; empty chooses by measured sharpness and noise.
+        maps: how many kinds of texture are mapped independently; two or more can disagree, and then nothing is kept.
+        instants: poses over each exposure, ends included; 1 gives the middle alone.
+        min_share: of the views that must be placed.
+        max_error_px: mean residual above which a map is refused.
+    """
+
+    arms: str = "spike"
+    kinds: tuple[str, ...] = ()
+    maps: int = 3
+    instants: int = 5
+    min_share: float = 0.8
+    max_error_px: float = 1.5
+
+    def __post_init__(self) -> None:
+        if self.arms not in ("spike", "rgb", "both"):
+            raise UsageError("unknown arms", value=self.arms, expected="spike, rgb or both")
+        if not (1 <= self.maps <= 8 and 1 <= self.instants <= 101 and 0 < self.min_share <= 1):
+            raise UsageError(
+                "maps, instants or min_share out of range", value=(self.maps, self.instants, self.min_share)
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Poses in a world of their own, and why to trust them or not.
+
+    Args:
+        images: names of all views asked for.
+        poses: cam_from_world [3,4] at mid-exposure, by view, of those placed.
+        paths: over the exposure, by view, of those where enough instants were.
+        best: the map they come from.
+        kinds: of texture mapped; the first is `best`'s.
+        looked: sharpness and noise of the kinds.
+        agreement_deg, agreement_share: largest median difference between the maps that agree.
+        agreeing: how many of the maps agree with the best, itself included, and how many there were.
+        reasons: why it is refused; empty when it is not.
+    """
+
+    images: tuple[str, ...]
+    poses: Mapping[str, Floats]
+    paths: Mapping[str, Path]
+    best: Map
+    kinds: tuple[str, ...]
+    looked: tuple[Looks, ...] = ()
+    agreement_deg: float | None = None
+    agreement_share: float | None = None
+    agreeing: tuple[int, int] = (1, 1)
+    reasons: tuple[str, ...] = ()
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+
+def estimate_poses(
+    views: Sequence[View],
+    camera: Camera,
+    wanted: Wanted,
+    options: Options,
+    *,
+    rgb_camera: Camera | None = None,
+    spike_from_rgb: Floats | None = None,
+    keep: Any = None,
+    done: Callable[[str], None] = lambda step: None,
+) -> Estimate:
+    """Map one picture of every view, and place further instants of each exposure in the map.
+
+    Args:
+        views: with spikes (except for `rgb`), as stored.
+        camera: of the spike arm, known.
+        wanted, options: what, and how COLMAP does it.
+        rgb_camera: of the frames; None: the same as `camera`.
+        spike_from_rgb: [3,4] for `both`; None: one centre, one direction.
+        keep: folder for COLMAP's files of the best map.
+        done: called with the name of each step.
+
+    Returns:
+        The estimate; look at `reasons` before using it.
+
+    Raises:
+        UsageError: fewer than three views, or no spikes.
+        HostError: COLMAP is missing or died.
+
+    Cost:
+        `maps` maps, and `instants` - 1 further pictures a view. See docs/poses.md.
+    """
+    usable = [v for v in views if v.spikes is not None or wanted.arms == "rgb"]
+    if len(usable) < 3:
+        raise UsageError("poses need three views with spikes at least", value=f"{len(usable)} of {len(views)} views")
+    names = tuple(v.name for v in usable)
+    if wanted.arms == "rgb":
+        pictures = {v.name: v.frame.pixels for v in usable}
+        found = build_map(pictures, rgb_camera or camera, options, keep=keep, done=done)
+        return _judged(Estimate(names, {n: p.pose for n, p in found.poses.items()}, {}, found, ("rgb",)), wanted)
+    ranked = _ranked(usable, wanted)
+    kinds = wanted.kinds or tuple(look.kind for look in ranked)
+    rigged = _Rigged(usable, camera, wanted, options, rgb_camera or camera, spike_from_rgb, keep, done)
+    maps: dict[str, Map] = {}
+    for kind in kinds[: wanted.maps]:
+        maps[kind] = rigged.map(kind, first=not maps)
+    enough = wanted.min_share * len(usable)
+    spare = [k for k in kinds[wanted.maps :] if k not in maps]
+    while max(len(m.poses) for m in maps.values()) < enough and spare:
+        maps[spare[0]] = rigged.map(spare.pop(0))
+    if max(len(m.poses) for m in maps.values()) < enough:
+        harder = replace(HARDER, seed=options.seed, threads=options.threads, max_error_px=options.max_error_px)
+        rigged.options = harder
+        maps[f"{kinds[0]}, low contrast"] = rigged.map(kinds[0])
+    return _judged(_settled(rigged, maps, names, ranked), wanted)
+
+
+class _Rigged:
+    """Maps of one scene by kind of texture, with what they share."""
+
+    def __init__(
+        self,
+        views: Sequence[View],
+        camera: Camera,
+        wanted: Wanted,
+        options: Options,
+        rgb_camera: Camera,
+        spike_from_rgb: Floats | None,
+        keep: Any,
+        done: Callable[[str], None],
+    ) -> None:
+        self.views, self.camera, self.wanted, self.options = views, camera, wanted, options
+        self.rgb_camera, self.spike_from_rgb, self.keep, self.done = rgb_camera, spike_from_rgb, keep, done
+        self.phases = np.linspace(0, 1, wanted.instants) if wanted.instants > 1 else np.array([0.5])
+
+    def map(self, kind: str, first: bool = False) -> Map:
+        """Map the middle instants by one kind of texture; the first map also takes the further instants."""
+        folder = "spike/" if self.wanted.arms == "both" else ""
+        pictures = {f"{folder}{v.name}": look_at(v, 0.5, kind) for v in self.views}
+        further = {}
+        if first and self.wanted.instants > 1:
+            for v in self.views:
+                for k, phase in enumerate(self.phases):
+                    if abs(phase - 0.5) > 1e-9:
+                        picture = look_at(v, phase, kind)
+                        further[f"{folder}{v.name}.at{k:03d}"] = (f"{folder}{v.name}", picture)
+        rig = None
+        if self.wanted.arms == "both":
+            pictures |= {f"rgb/{v.name}": v.frame.pixels for v in self.views}
+            rig = rig_config(self.camera, self.rgb_camera, self.spike_from_rgb)
+        keep = self.keep if first else None
+        step = f"{kind}: "
+        found = build_map(
+            pictures,
+            None if rig else self.camera,
+            self.options,
+            further=further,
+            rig=rig,
+            keep=keep,
+            done=lambda name: self.done(step + name),
+        )
+        return found if not folder else _arm(found, folder)
+
+
+def rig_config(spike: Camera, rgb: Camera, spike_from_rgb: Floats | None) -> list[dict[str, Any]]:
+    """COLMAP's configuration of two arms: the spike arm is the reference, the RGB arm's pose is fixed."""
+    from spikerig.calib.mapping import colmap_camera
+
+    pose = np.eye(3, 4) if spike_from_rgb is None else spike_from_rgb
+    rows: list[dict[str, Any]] = []
+    for name, camera in (("spike/", spike), ("rgb/", rgb)):
+        model = colmap_camera(camera)
+        row = {
+            "image_prefix": name,
+            "camera_model_name": model["model"],
+            "camera_params": list(map(float, model["params"])),
+        }
+        if name == "spike/":
+            row["ref_sensor"] = True
+        else:
+            turned = pose[:, :3].T  # rgb_from_spike
+            row["cam_from_rig_rotation"] = quaternion(turned).tolist()
+            row["cam_from_rig_translation"] = (-turned @ pose[:, 3]).tolist()
+        rows.append(row)
+    return [{"cameras": rows}]
+
+
+def quaternion(R: Floats) -> Floats:
+    """w x y z of a rotation [3,3], w >= 0."""
+    m = np.array(
+        [
+            [R[0, 0] + R[1, 1] + R[2, 2], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]],
+            [0, R[0, 0] - R[1, 1] - R[2, 2], R[0, 1] + R[1, 0], R[0, 2] + R[2, 0]],
+            [0, 0, R[1, 1] - R[0, 0] - R[2, 2], R[1, 2] + R[2, 1]],
+            [0, 0, 0, R[2, 2] - R[0, 0] - R[1, 1]],
+        ]
+    )
+    _, vectors = np.linalg.eigh(m + np.triu(m, 1).T)
+    q = vectors[:, -1]
+    return q if q[0] >= 0 else -q
+
+
+def look_at(view: View, phase: float, kind: str) -> NDArray[np.uint8]:
+    """The picture of a view by a kind of texture, at a phase of the exposure."""
+    if view.spikes is None:
+        raise UsageError("this view has no spikes", value=view.name)
+    if kind[:3] == "tfp" and kind[3:].isdigit() and int(kind[3:]) > view.spikes.ticks:
+        told = f"{view.name}, {kind}: {view.spikes.ticks} ticks"
+        raise UsageError("a texture does not fit the spikes", value=told, next="ask for a shorter window")
+    return picture_of(texture_of(view.spikes, tick_at(view, phase), kind))
+
+
+def tick_at(view: View, phase: float) -> float:
+    """The tick of the view's spikes at a phase of the middle row's exposure (0 its start, 1 its end)."""
+    frame, spikes = view.frame, view.spikes
+    if spikes is None or spikes.rate_hz is None:
+        raise UsageError("this view has no spikes with a known rate", value=view.name)
+    start = frame.mid_ns - frame.exposure_ns / 2
+    return float((start + phase * frame.exposure_ns - spikes.t0_ns) * spikes.rate_hz * 1e-9)
+
+
+def _ranked(views: Sequence[View], wanted: Wanted) -> tuple[Looks, ...]:
+    """Kinds of texture, best first, as measured on a few views; kinds whose window leaves the spikes are left out."""
+    some = [views[k] for k in np.unique(np.linspace(0, len(views) - 1, LOOKED_AT).round().astype(int))]
+    found = []
+    for kind in wanted.kinds or KINDS:
+        try:
+            found.append(looks([look_at(v, 0.5, kind) for v in some], kind))
+        except UsageError:
+            if wanted.kinds:
+                raise
+    if not found:
+        raise UsageError("the spikes are too short for any texture", expected="windows of 48 ticks and more")
+    return tuple(sorted(found, key=lambda look: -look.score))
+
+
+def _arm(found: Map, folder: str) -> Map:
+    """The pictures of one arm, their folder taken off their names."""
+
+    def mine(rows: Mapping[str, Any]) -> dict[str, Any]:
+        return {n.removeprefix(folder): p for n, p in rows.items() if n.startswith(folder)}
+
+    return replace(found, poses=mine(found.poses), placed=mine(found.placed))
+
+
+def _settled(rigged: _Rigged, maps: Mapping[str, Map], names: tuple[str, ...], ranked: tuple[Looks, ...]) -> Estimate:
+    """The largest group of maps that agree: its best map, poses averaged over the group, paths through its instants."""
+    apart = {(a, b): apart_by(maps[a], maps[b]) for a in maps for b in maps if a != b}
+    friends = {a: [a] + [b for b in maps if b != a and agree(apart[a, b])] for a in maps}
+    order = list(maps)
+    best = max(order, key=lambda k: (len(friends[k]), len(maps[k].poses), -order.index(k)))
+    group = friends[best]
+    poses = averaged([maps[k] for k in group])
+    pairs = [apart[best, k] for k in group[1:]]
+    first = maps[order[0]]
+    through = rigged.wanted.instants > 1 and order[0] in group  # the first map holds the further instants
+    paths = paths_through(first, maps[best], poses, rigged.phases) if through else {}
+    kinds = (best, *(k for k in order if k != best))
+    seconds: dict[str, float] = {}
+    for found in maps.values():
+        for step, spent in found.seconds.items():
+            seconds[step] = seconds.get(step, 0.0) + spent
+    return Estimate(
+        names,
+        poses,
+        paths,
+        maps[best],
+        kinds,
+        ranked,
+        max((p[0] for p in pairs), default=None),
+        max((p[1] for p in pairs), default=None),
+        (len(group), len(maps)),
+        (),
+        seconds,
+    )
+
+
+def _judged(found: Estimate, wanted: Wanted) -> Estimate:
+    """The estimate with the reasons against it."""
+    reasons = []
+    placed, asked = len(found.poses), len(found.images)
+    if placed < max(3, wanted.min_share * asked):
+        lost = ", ".join(sorted(set(found.images) - found.poses.keys())[:12])
+        reasons.append(f"only {placed} of {asked} views were placed ({wanted.min_share:.0%} asked for); not: {lost}")
+    if placed and not found.best.error_px <= wanted.max_error_px:
+        reasons.append(f"the mean residual is {found.best.error_px:.2f} px, more than {wanted.max_error_px:g}")
+    if found.agreeing[1] > 1 and found.agreeing[0] < 2:
+        reasons.append(f"{found.agreeing[1]} kinds of texture give maps that differ: none is to be trusted")
+    if placed >= 3:
+        stack = np.stack(list(found.poses.values()))
+        depth = _depth(found.best, stack)
+        if depth > 0 and extent(stack) < 1e-3 * depth:
+            reasons.append("the camera did not move: all views stand at one place")
+    return replace(found, reasons=tuple(reasons))
+
+
+def _depth(found: Map, stack: Floats) -> float:
+    if not len(found.xyz):
+        return 0.0
+    return float(np.median(np.linalg.norm(found.xyz[None, :2000] - centres(stack)[:, None], axis=2)))
