@@ -107,3 +107,77 @@ def _say(told: Measured, document: dict[str, Any], out: Path | None) -> None:
         note(f"{out}: written" + ("" if told.verdict.accepted else ", FORCED: the reasons above are recorded in it"))
     else:
         note("nothing is written; --force keeps it all the same where there is a fit, and records that")
+
+
+def photometric(
+    spike_dir: Annotated[Path, typer.Argument(help="Spike files of an even field, one a level of light.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The sensor's maps to write (.npz).")],
+    rgb_dir: Annotated[
+        Path | None,
+        typer.Option("--rgb", help="The RGB arm's pictures of the same levels, paired as in `calib board`."),
+    ] = None,
+    dark: Annotated[list[Path] | None, typer.Option(help="A spike file with the cap on; may be given again.")] = None,
+    lux: Annotated[str, typer.Option(help="The light of the levels, in any unit, by commas, in natural order.")] = "",
+    into: Annotated[
+        Path | None, typer.Option(help="A calibration that takes response, split ratio and flat field, in place.")
+    ] = None,
+    height: Height = None,
+    width: Width = None,
+    row_bits: RowBits = None,
+    axes: Axes = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Calibrate the sensors' light: flat field, dark rate, vignetting, response, the splitter's ratio."""
+    from spikerig.calib.even import measure_even
+    from spikerig.calib.flat import write_flat
+    from spikerig.calib.rig import read_calibration, write_calibration
+    from spikerig.calib.shots import Reading
+    from spikerig.dataset.outfile import refuse_existing
+
+    if out.suffix.lower() != ".npz":
+        raise UsageError("maps are written as .npz", value=out)
+    refuse_existing(out, force)
+    record = None if into is None else read_calibration(into)
+    reading = Reading(height, width, row_bits, axes)
+    told = measure_even(spike_dir, rgb_dir, tuple(dark or ()), _numbers(lux), reading)
+    write_flat(out, told.flat, force=force)
+    document = {"out": str(out), "into": None if into is None else str(into), **told.report}
+    if into is not None and record is not None:
+        changed = replace(
+            record,
+            flat={"file": out.name, "sha256": told.hash_of(out)},
+            split_ratio=record.split_ratio if told.response is None else round(told.response.split_ratio, 9),
+            response=record.response if told.response is None else told.response.response,
+        )
+        write_calibration(into, changed, force=True)
+        document["id"] = changed.id
+    if as_json:
+        emit("spikerig.calib.photometric/1", document)
+    _say_even(document, out)
+
+
+def _numbers(text: str) -> tuple[float, ...] | None:
+    if not text:
+        return None
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError("levels of light are numbers with commas between", value=text, expected="153,335") from None
+
+
+def _say_even(document: dict[str, Any], out: Path) -> None:
+    dark, electrons = document["dark_rate"], document["threshold_e"]
+    shot = "" if electrons is None else f", about {electrons:.0f} electrons a spike"
+    note(
+        f"{out}: {document['pixels']} pixels, {document['bad_pixels']} of them bad; pattern "
+        f"{100 * document['pattern_sd']:.2f} %, {100 * document['falloff']:.1f} % darker at the corners, dark rate "
+        f"{dark['mean']:.5f} +- {dark['sd']:.5f} spikes a tick{shot}"
+    )
+    for text in document["warnings"]:
+        note(f"note: {text}")
+    if document["split_ratio"] is not None:
+        response = document["response"]
+        colour = "colours too alike to tell the response" if response is None else (
+            "response to r, g, b " + ", ".join(f"{v:.3f}" for v in response))  # fmt: skip
+        note(f"{document['split_ratio']:.4f} spikes a tick at RGB white; {colour}")

@@ -59,7 +59,7 @@ def pair_up(spike_dir: Path, rgb_dir: Path) -> tuple[list[Pair], str]:
     Raises:
         UsageError: a folder is absent or empty, or nothing pairs the files.
     """
-    both = [_files(folder) for folder in (spike_dir, rgb_dir)]
+    both = [files_in(folder) for folder in (spike_dir, rgb_dir)]
     keys: tuple[tuple[str, Callable[[str], str | None]], ...] = (("stem", lambda s: s), ("number", _last_number))
     for how, key in keys:
         first, second = ({key(p.stem): p for p in files} for files in both)
@@ -78,7 +78,8 @@ def pair_up(spike_dir: Path, rgb_dir: Path) -> tuple[list[Pair], str]:
     return [Pair(a.stem, a, b) for a, b in zip(*both, strict=True)], "order"
 
 
-def _files(folder: Path) -> list[Path]:
+def files_in(folder: Path) -> list[Path]:
+    """Pictures and spike files of a folder in natural order; no stem may occur twice."""
     if not folder.is_dir():
         raise UsageError("there is no such folder", value=folder)
     kinds = (*SUFFIXES, *SPIKE_SUFFIXES)
@@ -110,13 +111,16 @@ def read_light(path: Path, reading: Reading) -> NDArray[np.float32]:
         pixels = read_image(path)[:, :, :3]
         linear = pixels if pixels.dtype == np.float32 else linear_from_srgb(pixels)
         return linear.mean(2, dtype=np.float32)
+    with open_reading(path, reading) as file:
+        return still_light(file, reading)
+
+
+def open_reading(path: Path, reading: Reading) -> SpikeFile:
+    """Open a spike file; the layout is given only to files that do not say theirs."""
     kind = path.suffix.lower()
     if kind in (".npz", ".h5"):
-        with open_spikes(path, axes=reading.axes if kind == ".npz" else None) as file:
-            return still_light(file, reading)
-    raster = {"height": reading.height, "width": reading.width, "row_bits": reading.row_bits}
-    with open_spikes(path, **raster) as file:  # type: ignore[arg-type]
-        return still_light(file, reading)
+        return open_spikes(path, axes=reading.axes if kind == ".npz" else None)
+    return open_spikes(path, height=reading.height, width=reading.width, row_bits=reading.row_bits)
 
 
 def still_light(file: SpikeFile, reading: Reading) -> NDArray[np.float32]:

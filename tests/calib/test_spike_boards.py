@@ -86,12 +86,10 @@ def test_the_simulators_own_board_is_seen_where_it_is() -> None:
     camera = Camera(np.array([[620.0, 0, 200], [0, 620, 125], [0, 0, 1]]), np.zeros(0), 400, 250)
     pose = bp.poses(1, 7)[0] * [[1, 1, 1, 1e-3]]
     light = 0.45 * Stage(world).picture(camera, pose, 6)[..., 0]
-    site, hooks = Site(250, 400, 0, 5), []
-    for name in ("shot_noise", "threshold_fpn"):
-        effect = effect_class(name)()
-        hooks.append((effect.per_tick, effect.begin(site)))
+    site = Site(250, 400, 0, 5)
+    hooks = [effect_class(name)().begin(site) for name in ("shot_noise", "threshold_fpn")]
     phase = site.draw("initial_phase").random((250, 400))
-    bits, _, _ = integrate(light[None].astype(np.float32), np.array([0, 256]), phase, sorted(hooks, key=lambda h: h[0]))
+    bits, _, _ = integrate(light[None].astype(np.float32), np.array([0, 256]), phase, hooks)
     stream = SpikeStream(bits, 400, 40_000.0)
     file = SpikeFile(Path("board"), "npz", 256, 250, 400, lambda a, b: stream.bits[a:b], lambda: None, 40_000.0)
     found = find(still_light(file, Reading(window=256)), Board(9, 7, 16.0))
