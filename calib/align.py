@@ -7,7 +7,7 @@ Spikes stay as they were recorded; only pictures made of them are warped.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from spikerig.calib.rig import Arm, RigCalibration
 from spikerig.calib.rolling import exposure_texture
 from spikerig.dataset.clocktime import frozen_array
 from spikerig.dataset.errors import DataError, UsageError
-from spikerig.dataset.images import linear_from_srgb, srgb8_from_linear
+from spikerig.dataset.images import linear_from_srgb, srgb_from_linear
 from spikerig.dataset.scene import Camera, Frame, View
 from spikerig.dataset.texture import Texture
 
@@ -75,7 +75,7 @@ class Aligned:
         texture: of the spikes, known only where the spike arm sees.
         sensor_row: float32[H,W] row of the raw RGB picture: a pixel was exposed from start_ns + row_ns * sensor_row.
         valid: bool[H,W], both arms see it.
-        frame: `light` encoded, with the times of the raw frame.
+        frame: `light` encoded, with the times of the raw frame (its rows are the raw picture's; see `own_rows`).
     """
 
     camera: Camera
@@ -88,6 +88,26 @@ class Aligned:
     def __post_init__(self) -> None:
         for name in ("light", "sensor_row", "valid"):
             object.__setattr__(self, name, frozen_array(getattr(self, name)))
+
+
+def own_rows(aligned: Aligned, raw_rows: int) -> tuple[Frame, NDArray[np.float32]]:
+    """The frame and its sensor rows with times told in the aligned picture's own rows, as a scene's views tell them.
+
+    Args:
+        aligned: a view.
+        raw_rows: rows of the raw picture.
+
+    Returns:
+        (frame, sensor_row): start_ns + row_ns * sensor_row is the same time as before, to half a nanosecond a row, and
+        the frame's `mid_ns` is that of its middle row.
+    """
+    f, rows = aligned.frame, len(aligned.sensor_row)
+    seen = aligned.sensor_row[aligned.valid] if aligned.valid.any() else np.array([0.0, raw_rows])
+    first, share = float(seen.min()), max(float(np.ptp(seen)), 1.0) / rows
+    row_ns = round(f.row_ns * share)
+    frame = replace(f, start_ns=f.start_ns + round(f.row_ns * first), row_ns=row_ns)
+    per_row = row_ns / f.row_ns if f.row_ns else share
+    return frame, np.where(aligned.valid, (aligned.sensor_row - first) / per_row, 0).astype(np.float32)
 
 
 def warp_of(
@@ -174,15 +194,24 @@ def pair(
             raise UsageError("the view has no spikes to align", value=view.name)
         texture = exposure_texture(view.spikes, view.frame, rows_of_spike_px(calibration))
     _check_size("the texture", texture.light.shape, calibration.spike)
-    pixels = view.frame.pixels
-    linear = linear_from_srgb(pixels) if view.frame.transfer == "srgb" else pixels.astype(np.float32) / 255
-    light = np.where(warp.valid[..., None], warp_light(warp, linear), 0)
-    coded = (
-        srgb8_from_linear(light) if view.frame.transfer == "srgb" else np.rint(light.clip(0, 1) * 255).astype(np.uint8)
-    )
-    f = view.frame
-    frame = Frame(coded, f.transfer, f.start_ns, f.exposure_ns, f.row_ns, f.clock)
+    light = np.where(warp.valid[..., None], warp_light(warp, linear_of(view.frame)), 0)
+    frame = replace(view.frame, pixels=coded_like(view.frame, light))
     return Aligned(warp.camera, light, warp_texture(warp, texture), warp.sensor_row, warp.valid, frame)
+
+
+def linear_of(frame: Frame) -> NDArray[np.float32]:
+    """A frame's linear light, float32[H,W,3]."""
+    return np.asarray(
+        linear_from_srgb(frame.pixels) if frame.transfer == "srgb" else frame.pixels / np.float32(frame.full),
+        np.float32,
+    )
+
+
+def coded_like(frame: Frame, light: NDArray[np.float32]) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """Linear light in a frame's own code and depth."""
+    clipped = np.clip(light, 0, 1)
+    coded = np.rint((srgb_from_linear(clipped) if frame.transfer == "srgb" else clipped) * frame.full)
+    return coded.astype(np.uint16) if frame.full > 255 else coded.astype(np.uint8)
 
 
 def warp_light(warp: Warp, linear: NDArray[np.float32]) -> NDArray[np.float32]:
