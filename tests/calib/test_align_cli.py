@@ -14,8 +14,7 @@ from spikerig.calib.parity import inverse
 from spikerig.calib.rig import RigCalibration, write_calibration
 from spikerig.dataset import cli
 from spikerig.dataset.scene import Pose
-from spikerig.dataset.store import open_scene
-from spikerig.dataset.store import verify_scene
+from spikerig.dataset.store import open_scene, verify_scene
 from spikerig.rigctl.sim.capture import capture
 from spikerig.rigctl.sim.effects.misalignment import Misalignment
 
