@@ -73,22 +73,24 @@ def outputs(spec: SceneSpec, lights: Sequence[tuple[int, Light]], effects: Seque
     return Outputs(np.stack(counts).astype(np.int64), np.stack(values))
 
 
-def check(case: Case, tolerances: Sequence[tuple[float, float]] = TOLERANCES) -> dict[str, Any]:
+def check(case: Case, tolerances: Sequence[tuple[float, float]] = TOLERANCES, views: int = SEEN) -> dict[str, Any]:
     """One scene: at each tolerance what auto changes; of each effect its bound and what leaving it out changes.
 
     Args:
         case: the scene.
         tolerances: (spikes, digital numbers).
+        views: that are simulated.
 
     Returns:
         JSON-ready: `auto`, a row a tolerance; `effects`, a row an effect.
     """
     spec = scene_of(case)
-    made, lights = plan(spec), lights_of(spec)
+    made, lights = plan(spec), lights_of(spec, views)
     whole = outputs(spec, lights, spec.effects)
     auto, seen = [], {tuple(e.name for e in spec.effects): whole}
+    bounds = {row.effect.name: row.bound for row in made.rows}
     for spikes, dn in tolerances:
-        chosen = judged(made.looked, spec.effects, Tolerance(spikes, dn))
+        chosen = judged(made.looked, spec.effects, Tolerance(spikes, dn), bounds)
         names = tuple(e.name for e in chosen.effects)
         if names not in seen:
             seen[names] = outputs(spec, lights, chosen.effects)

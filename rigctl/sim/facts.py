@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +43,7 @@ class Bound:
     formula: str
 
 
-def told(difference: Floats) -> float:
+def told(difference: NDArray[Any]) -> float:
     """A change that happened, told as `Bound` tells bounds: what 95 % of the values stay within; where 95 % do not
     change at all, the share that does, over 5 %."""
     size = np.abs(np.asarray(difference, np.float64))

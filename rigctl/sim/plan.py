@@ -105,15 +105,21 @@ def plan(spec: SceneSpec) -> Plan:
     return judged(look(spec), spec.effects, spec.tolerance)
 
 
-def judged(looked: Looked, effects: Sequence[Effect], tolerance: Tolerance | None) -> Plan:
+def judged(
+    looked: Looked,
+    effects: Sequence[Effect],
+    tolerance: Tolerance | None,
+    bounds: Mapping[str, Bound] | None = None,
+) -> Plan:
     """Choose among effects, smallest bound first, while the sum of what is left out stays within the tolerance.
 
     Args:
         looked: the scene.
         effects: those to choose from, in the order in which they act.
         tolerance: None keeps all.
+        bounds: of the effects by name, where they are known already.
     """
-    bounds = bounds_of(looked, effects)
+    bounds = bounds_of(looked, effects) if bounds is None else bounds
     if tolerance is None:
         rows = tuple(Judged(e, True, bounds[e.name], "listed") for e in effects)
         return Plan(rows, None, (0.0, 0.0), (0.0, 0.0), looked.samples, looked)
