@@ -255,6 +255,11 @@ def _ranked(views: Sequence[View], wanted: Wanted) -> tuple[Looks, ...]:
     return tuple(sorted(found, key=lambda look: -look.score))
 
 
+def best_kind(views: Sequence[View]) -> str:
+    """The kind of texture that looks best on these views, by measured sharpness and noise."""
+    return _ranked(views, Wanted())[0].kind
+
+
 def _arm(found: Map, folder: str) -> Map:
     """The pictures of one arm, their folder taken off their names."""
 
