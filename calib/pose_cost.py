@@ -124,7 +124,9 @@ def one_map(truth: Truth, options: Any, times: float) -> Map:
     if times != 1:
         wide, high = round(camera.width * times), round(camera.height * times)
         how = cv2.INTER_AREA if times < 1 else cv2.INTER_CUBIC
-        pictures = {n: np.asarray(cv2.resize(p, (wide, high), interpolation=how)) for n, p in pictures.items()}
+        pictures = {
+            n: np.asarray(cv2.resize(p, (wide, high), interpolation=how), np.uint8) for n, p in pictures.items()
+        }
         scale = np.diag([wide / camera.width, high / camera.height, 1.0])  # our pixel centres are at +0.5
         camera = replace(camera, K=scale @ camera.K, width=wide, height=high)
     return build_map(pictures, camera, options)

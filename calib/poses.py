@@ -128,7 +128,8 @@ def estimate_poses(
     enough = wanted.min_share * len(usable)
     spare = [k for k in kinds[wanted.maps :] if k not in maps]
     while max(len(m.poses) for m in maps.values()) < enough and spare:
-        maps[spare[0]] = rigged.map(spare.pop(0))
+        kind = spare.pop(0)
+        maps[kind] = rigged.map(kind)
     if max(len(m.poses) for m in maps.values()) < enough:
         harder = replace(HARDER, seed=options.seed, threads=options.threads, max_error_px=options.max_error_px)
         rigged.options = harder
