@@ -128,7 +128,8 @@ def estimate_poses(
     enough = wanted.min_share * len(usable)
     spare = [k for k in kinds[wanted.maps :] if k not in maps]
     while max(len(m.poses) for m in maps.values()) < enough and spare:
-        maps[spare[0]] = rigged.map(spare.pop(0))
+        kind = spare.pop(0)
+        maps[kind] = rigged.map(kind)
     if max(len(m.poses) for m in maps.values()) < enough:
         harder = replace(HARDER, seed=options.seed, threads=options.threads, max_error_px=options.max_error_px)
         rigged.options = harder
@@ -253,6 +254,11 @@ def _ranked(views: Sequence[View], wanted: Wanted) -> tuple[Looks, ...]:
     if not found:
         raise UsageError("the spikes are too short for any texture", expected="windows of 48 ticks and more")
     return tuple(sorted(found, key=lambda look: -look.score))
+
+
+def best_kind(views: Sequence[View]) -> str:
+    """The kind of texture that looks best on these views, by measured sharpness and noise."""
+    return _ranked(views, Wanted())[0].kind
 
 
 def _arm(found: Map, folder: str) -> Map:
