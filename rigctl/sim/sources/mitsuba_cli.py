@@ -42,10 +42,10 @@ def mitsuba(
     """
     from spikerig.dataset.outfile import refuse_existing
     from spikerig.rigctl.cli import cores, tell
-    from spikerig.rigctl.sim.folder import read_folder
-    from spikerig.rigctl.sim.frames import capture_folder
-    from spikerig.rigctl.sim.mitsuba_scene import plan_scene, render_folder
-    from spikerig.rigctl.sim.pictures import check_mending
+    from spikerig.rigctl.sim.sources.folder import read_folder
+    from spikerig.rigctl.sim.sources.frames import capture_folder
+    from spikerig.rigctl.sim.sources.mitsuba_scene import plan_scene, render_folder
+    from spikerig.rigctl.sim.sources.pictures import check_mending
 
     began = time.monotonic()
     if not (memory_gb >= 0 and patience > 0):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.rigctl.sim.pattern import Texture
+from spikerig.rigctl.sim.caster.pattern import Texture
 
 Floats = NDArray[np.floating]  # float32 unless said
 

@@ -19,8 +19,8 @@ from spikerig.dataset.errors import DataError, RigError, UsageError
 from spikerig.dataset.images import image_head
 from spikerig.dataset.scene import Camera
 from spikerig.rigctl.sim.limits import Faults
-from spikerig.rigctl.sim.pictures import check_mending
 from spikerig.rigctl.sim.schedule import Schedule, Track
+from spikerig.rigctl.sim.sources.pictures import check_mending
 from spikerig.rigctl.sim.spec import Settings, read_settings
 from spikerig.rigctl.sim.take import Rig
 

@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.rigctl.sim.hits import NEAR, TINY, Axes, Floats, dot3, vec3
-from spikerig.rigctl.sim.parts import SIDES, Ints, Parts, Vector, inner_normal, meet, present, surface
-from spikerig.rigctl.sim.solids import Vec3
+from spikerig.rigctl.sim.caster.hits import NEAR, TINY, Axes, Floats, dot3, vec3
+from spikerig.rigctl.sim.caster.parts import SIDES, Ints, Parts, Vector, inner_normal, meet, present, surface
+from spikerig.rigctl.sim.caster.solids import Vec3
 
 PAIRS = 1 << 17  # of a ray and a part, taken at once: they stay in the second-level cache
 CELLS = 128  # of the lamp's view of a crowd, along each axis

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.scene import Camera
-from spikerig.rigctl.sim.facts import Facts
-from spikerig.rigctl.sim.light import Stage, stage_of
-from spikerig.rigctl.sim.samples import GRID, error_left, parts_for, sampled
+from spikerig.rigctl.sim.caster.light import Stage, stage_of
+from spikerig.rigctl.sim.judge.facts import Facts
+from spikerig.rigctl.sim.judge.samples import GRID, error_left, parts_for, sampled
+from spikerig.rigctl.sim.judge.survey import Look, survey
 from spikerig.rigctl.sim.sensor import Light
 from spikerig.rigctl.sim.spec import Exposure, SceneSpec, Sensor
-from spikerig.rigctl.sim.survey import Look, survey
 from spikerig.rigctl.sim.viewpoint import camera_of, view_motion, view_path
 
 VIEWS = 3  # looked at

@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.errors import DataError
 from spikerig.dataset.exr import read_exr_depth
-from spikerig.rigctl.sim.calibrate import Work, least
-from spikerig.rigctl.sim.folder import Folder, Sequence
-from spikerig.rigctl.sim.looks import LOOK_PARTS, LOOK_PX, VIEWS, Looked, full_map, samples_left, spread
-from spikerig.rigctl.sim.pictures import read_light
-from spikerig.rigctl.sim.plan import Plan, chosen, judged
-from spikerig.rigctl.sim.points import read_points
-from spikerig.rigctl.sim.samples import motion_px, parts_for
+from spikerig.rigctl.sim.judge.calibrate import Work, least
+from spikerig.rigctl.sim.judge.looks import LOOK_PARTS, LOOK_PX, VIEWS, Looked, full_map, samples_left, spread
+from spikerig.rigctl.sim.judge.plan import Plan, chosen, judged
+from spikerig.rigctl.sim.judge.samples import motion_px, parts_for
+from spikerig.rigctl.sim.judge.survey import Look, survey
 from spikerig.rigctl.sim.sensor import Light
-from spikerig.rigctl.sim.survey import Look, survey
+from spikerig.rigctl.sim.sources.folder import Folder, Sequence
+from spikerig.rigctl.sim.sources.pictures import read_light
+from spikerig.rigctl.sim.sources.points import read_points
 
 Floats = NDArray[np.floating]
 

@@ -16,8 +16,8 @@ from spikerig.dataset.errors import HostError, UsageError
 from spikerig.dataset.terminal import Progress, emit, note
 
 if TYPE_CHECKING:
-    from spikerig.rigctl.sim.moving import Moving
-    from spikerig.rigctl.sim.retake import Exposures, Retake
+    from spikerig.rigctl.sim.sources.moving import Moving
+    from spikerig.rigctl.sim.sources.retake import Exposures, Retake
 
 LIST = "frames.json"
 
@@ -57,9 +57,9 @@ def spikes(
     needed, and none are made: for training use `sim frames`.
     """
     from spikerig.dataset.outfile import refuse_existing
-    from spikerig.rigctl.sim.moving import Look, open_moving
-    from spikerig.rigctl.sim.retake import Retake, spikes_of
-    from spikerig.rigctl.sim.sink import check_ending, spike_sink
+    from spikerig.rigctl.sim.sources.moving import Look, open_moving
+    from spikerig.rigctl.sim.sources.retake import Retake, spikes_of
+    from spikerig.rigctl.sim.sources.sink import check_ending, spike_sink
 
     began = time.monotonic()
     if background is not None and not 0 <= background <= 1:
@@ -133,8 +133,8 @@ def _frames_folder(folder: Path, force: bool) -> Iterator[Path]:
 
 def _camera(folder: Path, retake: Retake, fps: float, exposure_ms: float) -> tuple[Exposures, list[dict[str, Any]]]:
     from spikerig.dataset.images import write_image
-    from spikerig.rigctl.sim.retake import Exposures
     from spikerig.rigctl.sim.rgb import encode
+    from spikerig.rigctl.sim.sources.retake import Exposures
 
     shots: list[dict[str, Any]] = []
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from spikerig.dataset.scene import Camera
-from spikerig.rigctl.sim.calibrate import Work, least
-from spikerig.rigctl.sim.light import Stage, stage_of
-from spikerig.rigctl.sim.plan import Plan
+from spikerig.rigctl.sim.caster.light import Stage, stage_of
+from spikerig.rigctl.sim.judge.calibrate import Work, least
+from spikerig.rigctl.sim.judge.plan import Plan
 from spikerig.rigctl.sim.schedule import schedule
 from spikerig.rigctl.sim.spec import SceneSpec
 from spikerig.rigctl.sim.take import Rig

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.errors import DataError, RigError
 from spikerig.dataset.exr import read_exr_depth
-from spikerig.rigctl.sim.folder import Folder
-from spikerig.rigctl.sim.folder_plan import plan_folder, resolve_folder
+from spikerig.rigctl.sim.judge.folder_plan import plan_folder, resolve_folder
 from spikerig.rigctl.sim.limits import Faults
-from spikerig.rigctl.sim.pictures import Bad, as_report, read_light
-from spikerig.rigctl.sim.points import read_points
+from spikerig.rigctl.sim.sources.folder import Folder
+from spikerig.rigctl.sim.sources.pictures import Bad, as_report, read_light
+from spikerig.rigctl.sim.sources.points import read_points
 from spikerig.rigctl.sim.take import Taken, in_parallel, pack, share_of, surface, take_blurry, take_sharp
 
 

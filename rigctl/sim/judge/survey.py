@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.rigctl.sim.facts import Facts
+from spikerig.rigctl.sim.judge.facts import Facts
 from spikerig.rigctl.sim.rgb import window_weights
 from spikerig.rigctl.sim.sensor import Floats, Light, spike_light
 from spikerig.rigctl.sim.spec import Exposure, Sensor

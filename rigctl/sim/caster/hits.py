@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.rigctl.sim.solids import Box, Rect, Room, Sphere
+from spikerig.rigctl.sim.caster.solids import Box, Rect, Room, Sphere
 
 Floats = NDArray[np.floating]  # float32 unless said
 Axes = Sequence[Floats | np.floating]  # a vector, axis by axis

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.rigctl.sim.hits import Axes, dot3
-from spikerig.rigctl.sim.pattern import Texture
-from spikerig.rigctl.sim.world import World
+from spikerig.rigctl.sim.caster.hits import Axes, dot3
+from spikerig.rigctl.sim.caster.pattern import Texture
+from spikerig.rigctl.sim.caster.world import World
 
 Floats = NDArray[np.floating]  # float32 unless said
 

@@ -12,13 +12,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.rigctl.sim.grow import parts_of
+from spikerig.rigctl.sim.caster.grow import parts_of
+from spikerig.rigctl.sim.caster.parts import holds
+from spikerig.rigctl.sim.caster.pattern import Texture
+from spikerig.rigctl.sim.caster.solids import (
+    FAR,
+    KINDS,
+    Bricks,
+    Cylinder,
+    Plant,
+    Rect,
+    Room,
+    Scatter,
+    Solid,
+    Vec3,
+    skins,
+)
+from spikerig.rigctl.sim.caster.solids import Box as Box  # readers of a world find its plain solids here
+from spikerig.rigctl.sim.caster.solids import Sphere as Sphere
 from spikerig.rigctl.sim.limits import Faults, limits, nearest, read_record
-from spikerig.rigctl.sim.parts import holds
-from spikerig.rigctl.sim.pattern import Texture
-from spikerig.rigctl.sim.solids import FAR, KINDS, Bricks, Cylinder, Plant, Rect, Room, Scatter, Solid, Vec3, skins
-from spikerig.rigctl.sim.solids import Box as Box  # readers of a world find its plain solids here
-from spikerig.rigctl.sim.solids import Sphere as Sphere
 
 MAX_SOLIDS = 5000
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.errors import DataError, NumericsError, UsageError
 from spikerig.dataset.images import SUFFIXES
-from spikerig.rigctl.sim.pictures import Bad, as_report, check_mending, read_light
+from spikerig.rigctl.sim.sources.pictures import Bad, as_report, check_mending, read_light
 
 Picture = tuple[Fraction, NDArray[np.float32]]
 
@@ -164,7 +164,7 @@ def _folder(root: Path, look: Look) -> Moving:
 
 
 def _video(path: Path, look: Look) -> Moving:
-    from spikerig.rigctl.sim.video import open_video
+    from spikerig.rigctl.sim.sources.video import open_video
 
     if look.layer:
         raise UsageError("only EXR pictures have layers", value=f"{path}: {look.layer}")

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from spikerig.dataset.images import srgb_from_linear
-from spikerig.rigctl.sim.chain import bounds_of
 from spikerig.rigctl.sim.effects import Effect, parameters
-from spikerig.rigctl.sim.facts import PART, Bound, Facts
-from spikerig.rigctl.sim.looks import Looked, Samples, look
+from spikerig.rigctl.sim.judge.chain import bounds_of
+from spikerig.rigctl.sim.judge.facts import PART, Bound, Facts
+from spikerig.rigctl.sim.judge.looks import Looked, Samples, look
 from spikerig.rigctl.sim.spec import Exposure, SceneSpec, Tolerance
 
 EVEN = 1 - PART / 100  # a change of this much of a whole step moves so many values over a step, where they lie evenly

@@ -13,8 +13,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.rigctl.sim.cut import round_grid, whole
-from spikerig.rigctl.sim.pattern import Texture
+from spikerig.rigctl.sim.caster.cut import round_grid, whole
+from spikerig.rigctl.sim.caster.pattern import Texture
 
 Floats = NDArray[np.floating]  # float32 unless said
 Ints = NDArray[np.integer]

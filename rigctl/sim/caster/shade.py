@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.rigctl.sim.crowd import Crowd
-from spikerig.rigctl.sim.hits import NEAR, Axes, Floats, box_frame, dot, dot3, vec3
-from spikerig.rigctl.sim.parts import Ints, place
-from spikerig.rigctl.sim.pattern import Texture, lattice
-from spikerig.rigctl.sim.solids import Box, Rect, Room, Sphere, Vec3
-from spikerig.rigctl.sim.world import World
+from spikerig.rigctl.sim.caster.crowd import Crowd
+from spikerig.rigctl.sim.caster.hits import NEAR, Axes, Floats, box_frame, dot, dot3, vec3
+from spikerig.rigctl.sim.caster.parts import Ints, place
+from spikerig.rigctl.sim.caster.pattern import Texture, lattice
+from spikerig.rigctl.sim.caster.solids import Box, Rect, Room, Sphere, Vec3
+from spikerig.rigctl.sim.caster.world import World
 
 TEXELS = 256  # along the longest edge of any face
 CROWDED = 256  # along the edges of a crowd's sides at most

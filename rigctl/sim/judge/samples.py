@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.images import srgb_from_linear
 from spikerig.dataset.scene import Camera
-from spikerig.rigctl.sim.facts import PART
+from spikerig.rigctl.sim.judge.facts import PART
 from spikerig.rigctl.sim.sensor import Light, spike_light
 from spikerig.rigctl.sim.spec import Exposure, Sensor
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.scene import Camera
 from spikerig.rigctl.sim.effects import Effect, Stage
-from spikerig.rigctl.sim.plan import Plan
+from spikerig.rigctl.sim.judge.plan import Plan
 from spikerig.rigctl.sim.schedule import Schedule, Track, track_phases
 from spikerig.rigctl.sim.sensor import Light
 from spikerig.rigctl.sim.shelf import dumps, loads

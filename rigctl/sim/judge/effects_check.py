@@ -16,22 +16,22 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.errors import HostError
 from spikerig.dataset.kernels import count, fire
-from spikerig.rigctl.sim.calibrate import Costs, least, predict
 from spikerig.rigctl.sim.capture import capture, rgb_arm, rig_of
-from spikerig.rigctl.sim.casting import work_of
-from spikerig.rigctl.sim.check_scenes import Case, scene_of, table_of
+from spikerig.rigctl.sim.caster.light import stage_of
 from spikerig.rigctl.sim.effects import Effect
-from spikerig.rigctl.sim.facts import told
-from spikerig.rigctl.sim.light import stage_of
-from spikerig.rigctl.sim.looks import spread
-from spikerig.rigctl.sim.plan import Plan, judged, plan, resolve, resolved_table
+from spikerig.rigctl.sim.judge.calibrate import Costs, least, predict
+from spikerig.rigctl.sim.judge.casting import work_of
+from spikerig.rigctl.sim.judge.check_scenes import Case, scene_of, table_of
+from spikerig.rigctl.sim.judge.facts import told
+from spikerig.rigctl.sim.judge.looks import spread
+from spikerig.rigctl.sim.judge.plan import Plan, judged, plan, resolve, resolved_table
+from spikerig.rigctl.sim.judge.tomltext import toml_text
 from spikerig.rigctl.sim.rgb import encode, expose
 from spikerig.rigctl.sim.schedule import schedule
 from spikerig.rigctl.sim.sensor import Light, spike_light
 from spikerig.rigctl.sim.simulate import simulate
 from spikerig.rigctl.sim.spec import SceneSpec, Tolerance
 from spikerig.rigctl.sim.take import light_of
-from spikerig.rigctl.sim.tomltext import toml_text
 from spikerig.rigctl.sim.viewpoint import timed, view_path
 
 TOLERANCES = ((0.0, 0.0), (0.5, 0.5), (1.0, 1.0), (2.0, 2.0), (5.0, 5.0), (20.0, 20.0))

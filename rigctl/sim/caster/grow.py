@@ -7,10 +7,21 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from spikerig.rigctl.sim.caster.parts import Parts
+from spikerig.rigctl.sim.caster.pattern import Texture
+from spikerig.rigctl.sim.caster.solids import (
+    Box,
+    Bricks,
+    Cylinder,
+    Ellipsoid,
+    Plant,
+    Rect,
+    Room,
+    Scatter,
+    Solid,
+    Sphere,
+)
 from spikerig.rigctl.sim.draws import stream
-from spikerig.rigctl.sim.parts import Parts
-from spikerig.rigctl.sim.pattern import Texture
-from spikerig.rigctl.sim.solids import Box, Bricks, Cylinder, Ellipsoid, Plant, Rect, Room, Scatter, Solid, Sphere
 
 Floats = NDArray[np.float64]
 GOLDEN = np.pi * (3 - np.sqrt(5))

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.scene import Camera
-from spikerig.rigctl.sim.crowd import Crowd
-from spikerig.rigctl.sim.gloss import glossy
-from spikerig.rigctl.sim.grow import parts_of
-from spikerig.rigctl.sim.hits import HIT, TINY, Axes, Floats, screen
-from spikerig.rigctl.sim.pattern import albedo, lattice
-from spikerig.rigctl.sim.shade import TEXELS, CrowdMap, Face, LightMap, crowd_map, faces_of, light_map
-from spikerig.rigctl.sim.solids import Box, Rect, Room, Solid, Sphere
-from spikerig.rigctl.sim.world import World
+from spikerig.rigctl.sim.caster.crowd import Crowd
+from spikerig.rigctl.sim.caster.gloss import glossy
+from spikerig.rigctl.sim.caster.grow import parts_of
+from spikerig.rigctl.sim.caster.hits import HIT, TINY, Axes, Floats, screen
+from spikerig.rigctl.sim.caster.pattern import albedo, lattice
+from spikerig.rigctl.sim.caster.shade import TEXELS, CrowdMap, Face, LightMap, crowd_map, faces_of, light_map
+from spikerig.rigctl.sim.caster.solids import Box, Rect, Room, Solid, Sphere
+from spikerig.rigctl.sim.caster.world import World
 
 BAND = 32768  # rays cast at once: a band of rows that stays in the second-level cache
 

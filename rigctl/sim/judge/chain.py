@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.images import linear_from_srgb
 from spikerig.rigctl.sim.effects import Effect, Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import RARE, Bound, Facts, told
-from spikerig.rigctl.sim.looks import Looked, spread
+from spikerig.rigctl.sim.judge.facts import RARE, Bound, Facts, told
+from spikerig.rigctl.sim.judge.looks import Looked, spread
 from spikerig.rigctl.sim.rgb import encode
 from spikerig.rigctl.sim.schedule import start_ns
 from spikerig.rigctl.sim.simulate import lit

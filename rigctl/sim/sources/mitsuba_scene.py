@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.errors import DataError, HostError, UsageError
 from spikerig.rigctl.sim.capture import camera_of, view_path
+from spikerig.rigctl.sim.judge.tomltext import toml_text
 from spikerig.rigctl.sim.limits import Faults, limits, read_record
 from spikerig.rigctl.sim.schedule import schedule
 from spikerig.rigctl.sim.spec import SceneSpec, read_scene
-from spikerig.rigctl.sim.tomltext import toml_text
 
 VARIANTS = ("scalar_rgb", "scalar_spectral", "llvm_ad_rgb", "llvm_ad_spectral", "cuda_ad_rgb", "cuda_ad_spectral")
 RECORD = "mitsuba.json"
@@ -248,7 +248,7 @@ def _begin(plan: Plan, folder: Path, force: bool) -> None:
 
 def _watch(plan: Plan, job: dict[str, Any], patience_s: float, done: Callable[[str], None]) -> None:
     """Run the child and listen to it."""
-    words = [sys.executable, "-m", "spikerig.rigctl.sim.mitsuba_child"]
+    words = [sys.executable, "-m", "spikerig.rigctl.sim.sources.mitsuba_child"]
     child = subprocess.Popen(
         words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=dict(os.environ)
     )

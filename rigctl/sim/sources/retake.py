@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.errors import UsageError
 from spikerig.rigctl.sim.draws import stream
-from spikerig.rigctl.sim.moving import Moving
 from spikerig.rigctl.sim.sensor import spike_light
+from spikerig.rigctl.sim.sources.moving import Moving
 from spikerig.rigctl.sim.spec import Sensor
 from spikerig.rigctl.sim.stream import opened, spike_blocks
 
