@@ -116,7 +116,7 @@ def estimate_poses(
         raise UsageError("poses need three views with spikes at least", value=f"{len(usable)} of {len(views)} views")
     names = tuple(v.name for v in usable)
     if wanted.arms == "rgb":
-        pictures = {v.name: v.frame.pixels for v in usable}
+        pictures = {v.name: v.frame.pixels8 for v in usable}
         found = build_map(pictures, rgb_camera or camera, options, keep=keep, done=done)
         return _judged(Estimate(names, {n: p.pose for n, p in found.poses.items()}, {}, found, ("rgb",)), wanted)
     ranked = _ranked(usable, wanted)
@@ -168,7 +168,7 @@ class _Rigged:
                         further[f"{folder}{v.name}.at{k:03d}"] = (f"{folder}{v.name}", picture)
         rig = None
         if self.wanted.arms == "both":
-            pictures |= {f"rgb/{v.name}": v.frame.pixels for v in self.views}
+            pictures |= {f"rgb/{v.name}": v.frame.pixels8 for v in self.views}
             rig = rig_config(self.camera, self.rgb_camera, self.spike_from_rgb)
         keep = self.keep if first else None
         step = f"{kind}: "

@@ -1,8 +1,8 @@
 """The process that runs Mitsuba: a job on stdin, a JSON line a picture on stdout; it may be killed, and may crash.
 
-`python -m spikerig.rigctl.sim.sources.mitsuba_child < job.json`. The job: scene, folder, variant, threads, memory_bytes,
-width, height, fov_x_deg, spp, shots; a shot: file, kind ("light" or "depth"), world_from_cam (4x4, our axes), seed.
-Pictures that exist are left alone.
+`python -m spikerig.rigctl.sim.sources.mitsuba_child < job.json`. The job: scene, folder, variant, threads,
+memory_bytes, width, height, fov_x_deg, spp, shots; a shot: file, kind ("light" or "depth"), world_from_cam (4x4, our
+axes), seed. Pictures that exist are left alone.
 """
 
 from __future__ import annotations
