@@ -116,7 +116,7 @@ def estimate_poses(
         raise UsageError("poses need three views with spikes at least", value=f"{len(usable)} of {len(views)} views")
     names = tuple(v.name for v in usable)
     if wanted.arms == "rgb":
-        pictures = {v.name: v.frame.pixels for v in usable}
+        pictures = {v.name: v.frame.pixels8 for v in usable}
         found = build_map(pictures, rgb_camera or camera, options, keep=keep, done=done)
         return _judged(Estimate(names, {n: p.pose for n, p in found.poses.items()}, {}, found, ("rgb",)), wanted)
     ranked = _ranked(usable, wanted)
@@ -128,7 +128,8 @@ def estimate_poses(
     enough = wanted.min_share * len(usable)
     spare = [k for k in kinds[wanted.maps :] if k not in maps]
     while max(len(m.poses) for m in maps.values()) < enough and spare:
-        maps[spare[0]] = rigged.map(spare.pop(0))
+        kind = spare.pop(0)
+        maps[kind] = rigged.map(kind)
     if max(len(m.poses) for m in maps.values()) < enough:
         harder = replace(HARDER, seed=options.seed, threads=options.threads, max_error_px=options.max_error_px)
         rigged.options = harder
@@ -167,7 +168,7 @@ class _Rigged:
                         further[f"{folder}{v.name}.at{k:03d}"] = (f"{folder}{v.name}", picture)
         rig = None
         if self.wanted.arms == "both":
-            pictures |= {f"rgb/{v.name}": v.frame.pixels for v in self.views}
+            pictures |= {f"rgb/{v.name}": v.frame.pixels8 for v in self.views}
             rig = rig_config(self.camera, self.rgb_camera, self.spike_from_rgb)
         keep = self.keep if first else None
         step = f"{kind}: "
@@ -253,6 +254,11 @@ def _ranked(views: Sequence[View], wanted: Wanted) -> tuple[Looks, ...]:
     if not found:
         raise UsageError("the spikes are too short for any texture", expected="windows of 48 ticks and more")
     return tuple(sorted(found, key=lambda look: -look.score))
+
+
+def best_kind(views: Sequence[View]) -> str:
+    """The kind of texture that looks best on these views, by measured sharpness and noise."""
+    return _ranked(views, Wanted())[0].kind
 
 
 def _arm(found: Map, folder: str) -> Map:

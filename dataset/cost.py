@@ -54,7 +54,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """A finished sweep: what was turned, what was measured, where, and by which command."""
+    """A finished sweep: what was turned, what was measured, where, and by which command; repeats 0: all ran once."""
 
     name: str
     title: str
@@ -125,7 +125,8 @@ def table(done: Sweep) -> str:
         lines.append(
             f"| {r.series} | {r.value} | {r.error:.4g}{tail} | {r.cpu_seconds:.3g} | {r.wall_seconds:.3g} | {peak} |"
         )
-    lines += ["", f"Error against {done.reference}; median of {done.repeats} after one discarded run."]
+    ran = f"median of {done.repeats} after one discarded run" if done.repeats else "each ran once"
+    lines += ["", f"Error against {done.reference}; {ran}."]
     lines += [f"Left out: {text}" for text in done.omissions]
     lines += [f"Command: `{done.command}`. {machine.caption(done.machine)}.", ""]
     return "\n".join(lines)

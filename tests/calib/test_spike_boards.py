@@ -67,8 +67,8 @@ def test_the_simulators_own_board_is_seen_where_it_is() -> None:
     from spikerig.calib.shots import Reading, still_light
     from spikerig.dataset.scene import Camera
     from spikerig.dataset.stream import SpikeFile
+    from spikerig.rigctl.sim.caster.light import Stage
     from spikerig.rigctl.sim.effects import Site, effect_class
-    from spikerig.rigctl.sim.light import Stage
     from spikerig.rigctl.sim.sensor import integrate
     from spikerig.rigctl.sim.spec import read_scene
 
