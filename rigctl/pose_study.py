@@ -1,7 +1,7 @@
 """`spikerig cost pose-study`: poses from blurry pictures against poses from spikes, on simulated scenes with truth.
 
-Three ways, with the same options: one map of the blurry pictures, one map of spike textures, and what `calib poses` does:
-three kinds of texture are mapped, and a result on which they do not agree is refused (and then counts as no success).
+Three ways, with the same options: one map of the blurry pictures, one map of spike textures, and what `calib poses`
+does: three kinds of texture are mapped, and a result on which they do not agree is refused (and is no success).
 """
 
 from __future__ import annotations
