@@ -70,7 +70,7 @@ def picture_of(texture: Texture) -> NDArray[np.uint8]:
 def frame_picture(frame: Frame) -> NDArray[np.uint8]:
     """A frame's pixels, 8 bits: of 16, the upper ones."""
     pixels = frame.pixels
-    return pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
+    return (pixels >> 8 if pixels.dtype == np.uint16 else pixels).astype(np.uint8, copy=False)
 
 
 def looks(pictures: list[NDArray[np.uint8]], kind: str) -> Looks:
