@@ -22,10 +22,14 @@ def poses(
     maps: Annotated[int, typer.Option(help="Kinds mapped independently; they must agree.")] = 3,
     instants: Annotated[int, typer.Option(help="Poses over each exposure; 1: the middle alone.")] = 5,
     min_share: Annotated[float, typer.Option(help="Of the views that must be placed.")] = 0.8,
-    max_error_px: Annotated[float, typer.Option(help="Of a match and of an observation.")] = 1.5,
+    max_error_px: Annotated[
+        float | None, typer.Option(help="Of a match and of an observation; scenes 1.5, folders 4.")
+    ] = None,
     pairs: Annotated[str, typer.Option(help="auto, exhaustive or sequential.")] = "auto",
     mapper: Annotated[str, typer.Option(help="incremental or global.")] = "incremental",
-    peak_threshold: Annotated[float, typer.Option(help="Of SIFT; lower finds more in low contrast.")] = 0.0033,
+    peak_threshold: Annotated[
+        float | None, typer.Option(help="Of SIFT; lower finds more in low contrast; scenes 0.0033, folders 0.0067.")
+    ] = None,
     max_features: Annotated[int, typer.Option(help="A picture.")] = 4096,
     max_image_size: Annotated[int, typer.Option(help="Longer sides are made smaller; -1: never.")] = -1,
     shared_camera: Annotated[bool, typer.Option(help="A folder's pictures are of one camera.")] = False,
@@ -41,9 +45,12 @@ def poses(
     from spikerig.calib.mapping import Options
     from spikerig.calib.poses import Wanted
 
+    # A folder's pictures are of unknown cameras and any size: COLMAP's own defaults.
+    peak, off = (0.0067, 4.0) if source.is_dir() else (Options().peak_threshold, Options().max_error_px)
+    off = off if max_error_px is None else max_error_px
     options = Options(
-        peak_threshold, max_features, pairs=pairs, mapper=mapper, seed=seed, threads=threads,
-        max_error_px=max_error_px, max_image_size=max_image_size,
+        peak if peak_threshold is None else peak_threshold, max_features, pairs=pairs, mapper=mapper, seed=seed,
+        threads=threads, max_error_px=off, max_image_size=max_image_size,
     )  # fmt: skip
     if out is not None and (out / "poses.json").exists() and not force:
         raise UsageError("there is an earlier result", value=out / "poses.json", next="give --force to replace it")
@@ -55,7 +62,7 @@ def poses(
         if write and write_to:
             raise UsageError("give --write or --write-to, not both")
         listed = tuple(k for k in kinds.split(",") if k)
-        wanted = Wanted(arms, listed, min(maps, len(listed)) if listed else maps, instants, min_share, max_error_px)
+        wanted = Wanted(arms, listed, min(maps, len(listed)) if listed else maps, instants, min_share, off)
         told = _scene(source, out, wanted, options, write, write_to, force)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
@@ -103,8 +110,6 @@ def _scene(
 
 
 def _folder(source: Path, out: Path | None, options: Any, shared: bool, min_share: float) -> dict[str, Any]:
-    from dataclasses import replace
-
     from spikerig.calib.mapping import build_map
     from spikerig.calib.poses import Estimate
 
@@ -118,15 +123,14 @@ def _folder(source: Path, out: Path | None, options: Any, shared: bool, min_shar
     bar = Progress("mapping", 0, "steps")
     keep = None if out is None else out / "colmap"
     pictures = {p.stem: p for p in files}
-    tuned = replace(options, max_error_px=max(options.max_error_px, 4.0))  # COLMAP's own, for pictures of any size
     more = {"separate_cameras": not shared, "keep": keep}
-    found = build_map(pictures, None, tuned, **more, done=lambda step: bar.step(1, step))
+    found = build_map(pictures, None, options, **more, done=lambda step: bar.step(1, step))
     poses = {n: p.pose for n, p in found.poses.items()}
     reasons = ()
     if len(poses) < max(3, min_share * len(files)):
         lost = ", ".join(sorted(set(stems) - poses.keys())[:12])
         reasons = (f"only {len(poses)} of {len(files)} pictures were placed ({min_share:.0%} asked for); not: {lost}",)
-    told = report(Estimate(tuple(stems), poses, {}, found, ("pictures",), reasons=reasons), tuned)
+    told = report(Estimate(tuple(stems), poses, {}, found, ("pictures",), reasons=reasons), options)
     return told | {"source": str(source), "truth": None, "forced": False}
 
 
@@ -145,6 +149,7 @@ def report(estimate: Any, options: Any) -> dict[str, Any]:
         "models": list(best.models),
         "error_px": None if best.error_px != best.error_px else best.error_px,
         "points": len(best.xyz),
+        "free_focal": dict(best.focal) or None,
         "kinds": list(estimate.kinds),
         "textures": [{"kind": k.kind, "sharpness": k.sharpness, "noise": k.noise} for k in estimate.looked],
         "agreement": {

@@ -30,8 +30,8 @@ def effects(
     Exit 1 where a promise is not kept; the figures are written all the same.
     """
     from spikerig.rigctl import effects_report
-    from spikerig.rigctl.sim import effects_check
-    from spikerig.rigctl.sim.check_scenes import CASES, case_named
+    from spikerig.rigctl.sim.judge import effects_check
+    from spikerig.rigctl.sim.judge.check_scenes import CASES, case_named
 
     if out is not None and (out / "effects_check.json").exists() and not force:
         raise UsageError("an earlier result is there", value=out / "effects_check.json", next="add --force")

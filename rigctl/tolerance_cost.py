@@ -15,10 +15,10 @@ TOLERANCES = (0.0, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 
 def settings(scene: str, views: int) -> list[cost.Setting]:
     """The plan's choice at each tolerance: change of counts and of RGB values, against all effects."""
-    from spikerig.rigctl.sim.check_scenes import case_named, scene_of
-    from spikerig.rigctl.sim.effects_check import lights_of, outputs
-    from spikerig.rigctl.sim.facts import told
-    from spikerig.rigctl.sim.plan import judged, plan
+    from spikerig.rigctl.sim.judge.check_scenes import case_named, scene_of
+    from spikerig.rigctl.sim.judge.effects_check import lights_of, outputs
+    from spikerig.rigctl.sim.judge.facts import told
+    from spikerig.rigctl.sim.judge.plan import judged, plan
     from spikerig.rigctl.sim.spec import Tolerance
 
     spec = scene_of(case_named(scene))

@@ -7,11 +7,11 @@ import math
 import re
 from typing import Any
 
+from spikerig.rigctl.sim.caster.pattern import Texture
+from spikerig.rigctl.sim.caster.world import KINDS, Air, Lamp
 from spikerig.rigctl.sim.events import EventCamera
 from spikerig.rigctl.sim.orbit import Orbit
-from spikerig.rigctl.sim.pattern import Texture
 from spikerig.rigctl.sim.spec import PAPER, Cloud, Exposure, Lens, RgbCamera, Sensor, Shake, Tolerance
-from spikerig.rigctl.sim.world import KINDS, Air, Lamp
 
 TABLES: tuple[tuple[str, type], ...] = (
     ("camera", Lens),

@@ -10,15 +10,15 @@ import pytest
 
 from spikerig.dataset.kernels import count
 from spikerig.rigctl.sim.capture import camera_of, view_path
+from spikerig.rigctl.sim.caster.light import stage_of
 from spikerig.rigctl.sim.effects import effect_class
 from spikerig.rigctl.sim.effects.phase import InitialPhase
-from spikerig.rigctl.sim.facts import PART, SLACK, Facts, surplus
-from spikerig.rigctl.sim.light import stage_of
+from spikerig.rigctl.sim.judge.facts import PART, SLACK, Facts, surplus
+from spikerig.rigctl.sim.judge.survey import Look, survey
 from spikerig.rigctl.sim.schedule import schedule, start_ns
 from spikerig.rigctl.sim.sensor import Light
 from spikerig.rigctl.sim.simulate import simulate
 from spikerig.rigctl.sim.spec import SceneSpec, load_scene_toml
-from spikerig.rigctl.sim.survey import Look, survey
 
 WIDTH, HEIGHT = 80, 50
 # gain, pixels of motion, exposure ms, margin ticks

@@ -14,25 +14,25 @@ from spikerig.dataset import cli
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.images import write_image
 from spikerig.dataset.store import open_scene
-from spikerig.rigctl.sim import calibrate, effects_check
 from spikerig.rigctl.sim.capture import capture, take_view
-from spikerig.rigctl.sim.casting import work_of
-from spikerig.rigctl.sim.chain import bounds_of
-from spikerig.rigctl.sim.check_scenes import CASES, case_named, scene_of, table_of
+from spikerig.rigctl.sim.caster.light import stage_of
 from spikerig.rigctl.sim.effects import Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import Bound, Facts, told
-from spikerig.rigctl.sim.folder import read_folder
-from spikerig.rigctl.sim.folder_plan import plan_folder, work_folder
-from spikerig.rigctl.sim.frames import capture_folder
-from spikerig.rigctl.sim.light import stage_of
-from spikerig.rigctl.sim.looks import look, spread
-from spikerig.rigctl.sim.plan import Plan, judged, plan, resolve, resolved_table
-from spikerig.rigctl.sim.samples import STEP_PX, error_left, motion_px, sampled
+from spikerig.rigctl.sim.judge import calibrate, effects_check
+from spikerig.rigctl.sim.judge.casting import work_of
+from spikerig.rigctl.sim.judge.chain import bounds_of
+from spikerig.rigctl.sim.judge.check_scenes import CASES, case_named, scene_of, table_of
+from spikerig.rigctl.sim.judge.facts import Bound, Facts, told
+from spikerig.rigctl.sim.judge.folder_plan import plan_folder, work_folder
+from spikerig.rigctl.sim.judge.looks import look, spread
+from spikerig.rigctl.sim.judge.plan import Plan, judged, plan, resolve, resolved_table
+from spikerig.rigctl.sim.judge.samples import STEP_PX, error_left, motion_px, sampled
+from spikerig.rigctl.sim.judge.tomltext import toml_text
 from spikerig.rigctl.sim.schedule import schedule
 from spikerig.rigctl.sim.sensor import Light
 from spikerig.rigctl.sim.shake import rotation
+from spikerig.rigctl.sim.sources.folder import read_folder
+from spikerig.rigctl.sim.sources.frames import capture_folder
 from spikerig.rigctl.sim.spec import Exposure, Sensor, Tolerance, load_scene_toml, read_scene
-from spikerig.rigctl.sim.tomltext import toml_text
 from spikerig.rigctl.sim.viewpoint import camera_of, timed, view_motion, view_path
 
 AUTO = {"effects": "auto", "consider": ["shot_noise", "dark_current", "threshold_fpn", "read_noise"]}

@@ -9,7 +9,7 @@ import numpy as np
 
 from spikerig.dataset.spikes import SpikeStream
 from spikerig.rigctl.sim.effects import Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import RARE, Bound, Facts
+from spikerig.rigctl.sim.judge.facts import RARE, Bound, Facts
 from spikerig.rigctl.sim.limits import limits
 
 PART = 1 << 20  # bits drawn for at once
