@@ -173,6 +173,9 @@ def test_effects_are_judged_on_what_reaches_them() -> None:
     for consider, expected in ((["threshold_fpn"], 0), (["threshold_fpn", {"name": "dark_current", "rate": 0.2}], 1)):
         spec = small(effects="auto", consider=consider, **night)
         assert (bounds_of(look(spec), spec.effects)["threshold_fpn"].spikes > 0) == expected
+    for consider, expected in ((["white_balance"], 0), (["white_balance", {"name": "rgb_noise", "read_e": 60.0}], 1)):
+        spec = small(effects="auto", consider=consider, **night)
+        assert (bounds_of(look(spec), spec.effects)["white_balance"].dn > 0) == expected
     plain = small(effects="auto", consider=["white_balance"])
     filed = small(effects="auto", consider=["white_balance", {"name": "jpeg", "quality": 60}])
     dn = [bounds_of(look(spec), spec.effects)["white_balance"] for spec in (plain, filed)]
