@@ -39,7 +39,8 @@ class Options:
         mapper: `incremental` or `global`.
         max_image_size: longer sides are made smaller; -1 keeps all.
         seed: of RANSAC and of the mapper.
-        threads: of features and matching; 0 is one a core. The mapper runs on one, so that it repeats.
+        threads: of features and matching; 0 is one a core. The mapper runs on one. Same seed and threads, same bits;
+            another number of threads numbers the matches differently, and gives a nearby answer.
     """
 
     peak_threshold: float = 0.0033

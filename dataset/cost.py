@@ -150,7 +150,8 @@ def plot(done: Sweep, path: Path) -> None:
     log = any(r.error > 0 for r in done.rows)  # points without error are then left out
     for series in dict.fromkeys(r.series for r in done.rows):
         rows = [r for r in done.rows if r.series == series]
-        axes.plot([r.cpu_seconds for r in rows], [r.error for r in rows], "o-", label=series, markersize=4)
+        style = "o-" if all(isinstance(r.value, int | float) for r in rows) else "o"  # names have no order
+        axes.plot([r.cpu_seconds for r in rows], [r.error for r in rows], style, label=series, markersize=4)
         for r in [r for r in rows if not log or r.error > 0]:
             axes.annotate(str(r.value), (r.cpu_seconds, r.error), fontsize=6, xytext=(2, 3), textcoords="offset points")
     axes.set(xscale="log", xlabel="CPU seconds", ylabel=f"error ({done.error_unit})", title=done.title)

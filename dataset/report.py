@@ -83,6 +83,8 @@ def summary(result: dict[str, Any]) -> list[str]:
     lines = []
     for scene, r in result["scenes"].items():
         lines.append(f"{scene} (sharp held-out views, pose label {r['pose_label']}):")
+        if r.get("plan"):
+            lines.append(f"  {r['plan']}")
         for name, m in r["methods"].items():
             lines.append(
                 f"  {NAMES.get(name, name):<30} {m['psnr']:6.2f} dB  luma {m['luma_psnr']:6.2f}  SSIM {m['ssim']:.4f}"
@@ -115,7 +117,8 @@ def _scene(out: Path, scene: str, done: dict[str, Any]) -> dict[str, Any]:
         }
         label = score["pose_label"]
         history[name] = json.loads((out / f"{scene}-{name}" / "history.json").read_text(encoding="utf-8"))
-    return {"methods": methods, **gains(methods), "pose_label": label, "history": history}
+    plan = (done.get(f"{scene}-capture", {}).get("said") or {}).get("plan_line")
+    return {"methods": methods, **gains(methods), "pose_label": label, "plan": plan, "history": history}
 
 
 def _figures(out: Path, scene: str, result: dict[str, Any]) -> dict[str, bytes]:
@@ -280,6 +283,8 @@ def _page(result: dict[str, Any], pictures: dict[str, dict[str, bytes]]) -> str:
             f"</table><p>A blurry view is labelled with its <b>{esc(str(r['pose_label']))}</b>-exposure pose, here and "
             "in every row. PSNR: clipped, rounded to 8 bits, mean over views. Luma PSNR leaves colour errors out.</p>"
         )
+        if r.get("plan"):
+            parts.append(f"<p>The simulator's plan: {esc(str(r['plan']))}.</p>")
         parts.append(_img(pictures[scene]["curve"], "svg+xml", "PSNR over training seconds"))
         parts.append(_img(pictures[scene]["errors"], "png", "error maps"))
     parts.append(

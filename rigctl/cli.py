@@ -59,8 +59,8 @@ def frames(
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
 ) -> None:
     """Simulate a capture from rendered sub-frames: linear EXR (or sRGB PNG) sequences with poses become a scene."""
-    from spikerig.rigctl.sim.folder import read_folder
-    from spikerig.rigctl.sim.frames import capture_folder
+    from spikerig.rigctl.sim.sources.folder import read_folder
+    from spikerig.rigctl.sim.sources.frames import capture_folder
 
     began = time.monotonic()
     found = read_folder(folder, settings, protocol=protocol, seed=seed, bad_values=bad_values)

@@ -67,7 +67,7 @@ def light_of(spec: SceneSpec, view: int, sub_poses: int) -> Light:
     import numpy as np
 
     from spikerig.rigctl.sim.capture import camera_of, view_path
-    from spikerig.rigctl.sim.light import stage_of
+    from spikerig.rigctl.sim.caster.light import stage_of
     from spikerig.rigctl.sim.schedule import schedule
     from spikerig.rigctl.sim.sensor import Light
 
@@ -150,7 +150,7 @@ def ray_settings(spec: SceneSpec, view: int) -> list[cost.Setting]:
     import numpy as np
 
     from spikerig.rigctl.sim.capture import camera_of, view_path
-    from spikerig.rigctl.sim.light import stage_of
+    from spikerig.rigctl.sim.caster.light import stage_of
 
     stage, camera = stage_of(spec.world), camera_of(spec)
     pose = view_path(spec, view).poses(0.5)[0]

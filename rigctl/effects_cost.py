@@ -30,8 +30,8 @@ def effects(
     Exit 1 where a promise is not kept; the figures are written all the same.
     """
     from spikerig.rigctl import effects_report
-    from spikerig.rigctl.sim import effects_check
-    from spikerig.rigctl.sim.check_scenes import CASES, case_named
+    from spikerig.rigctl.sim.judge import effects_check
+    from spikerig.rigctl.sim.judge.check_scenes import CASES, case_named
 
     if out is not None and (out / "effects_check.json").exists() and not force:
         raise UsageError("an earlier result is there", value=out / "effects_check.json", next="add --force")
@@ -62,18 +62,14 @@ def effects(
 def found(told: dict[str, Any]) -> list[dict[str, Any]]:
     """Each promise, whether it was kept, and the figures."""
     autos = [(scene["scene"], row) for scene in told["scenes"] for row in scene["auto"]]
-    worst = {
-        key: min(autos, key=lambda pair, key=key: pair[1][f"within_{key}"], default=None) for key in ("spikes", "dn")
-    }
     rows = []
     for key, words in (("spikes", "spike counts"), ("dn", "RGB values")):
-        name, row = worst[key]
-        share = row[f"within_{key}"]
+        share, name, at = min((row[f"within_{key}"], name, row["tolerance"]) for name, row in autos)
         rows.append(
             _row(
                 share >= WITHIN,
                 f"auto within the tolerance of all effects in at least {100 * share:.2f} % of {words} (worst: {name} "
-                f"at {row['tolerance']:g}); {len(told['scenes'])} scenes x {len(autos) // len(told['scenes'])} "
+                f"at {at:g}); {len(told['scenes'])} scenes x {len(autos) // len(told['scenes'])} "
                 "tolerances",
             )
         )

@@ -22,8 +22,8 @@ def settings(scene: str, view: int) -> list[cost.Setting]:
     import numpy as np
 
     from spikerig.rigctl.sim.capture import camera_of, view_path
+    from spikerig.rigctl.sim.caster.light import Stage
     from spikerig.rigctl.sim.events import EventCamera, simulate_events
-    from spikerig.rigctl.sim.light import Stage
     from spikerig.rigctl.sim.spec import load_scene_toml
 
     spec = load_scene_toml(scene)

@@ -13,8 +13,8 @@ from spikerig.dataset.outfile import refuse_existing, whole_file
 from spikerig.dataset.terminal import emit, note
 
 if TYPE_CHECKING:
-    from spikerig.rigctl.sim.calibrate import Costs, Work
-    from spikerig.rigctl.sim.plan import Plan
+    from spikerig.rigctl.sim.judge.calibrate import Costs, Work
+    from spikerig.rigctl.sim.judge.plan import Plan
 
 
 def effects(
@@ -39,11 +39,11 @@ def effects(
     source = _folder(Path(scene), settings) if Path(scene).is_dir() else _scene(scene, settings)
     made, costs = source.plan(), None
     if seconds:
-        from spikerig.rigctl.sim.calibrate import predict
+        from spikerig.rigctl.sim.judge.calibrate import predict
 
         costs = predict(source.work(made), made)
     if write is not None:
-        from spikerig.rigctl.sim.tomltext import toml_text
+        from spikerig.rigctl.sim.judge.tomltext import toml_text
 
         with whole_file(write, force=force) as part:
             part.write_text(toml_text(source.resolved(made)), encoding="utf-8")
@@ -64,8 +64,8 @@ class _Source(NamedTuple):
 
 
 def _scene(scene: str, settings: Path | None) -> _Source:
-    from spikerig.rigctl.sim.casting import work_of
-    from spikerig.rigctl.sim.plan import plan, resolved_table
+    from spikerig.rigctl.sim.judge.casting import work_of
+    from spikerig.rigctl.sim.judge.plan import plan, resolved_table
     from spikerig.rigctl.sim.spec import load_scene_toml, scene_table
 
     if settings is not None:
@@ -77,9 +77,9 @@ def _scene(scene: str, settings: Path | None) -> _Source:
 
 
 def _folder(folder: Path, settings: Path | None) -> _Source:
-    from spikerig.rigctl.sim.folder import read_folder, settings_table
-    from spikerig.rigctl.sim.folder_plan import plan_folder, work_folder
-    from spikerig.rigctl.sim.plan import resolved_table
+    from spikerig.rigctl.sim.judge.folder_plan import plan_folder, work_folder
+    from spikerig.rigctl.sim.judge.plan import resolved_table
+    from spikerig.rigctl.sim.sources.folder import read_folder, settings_table
 
     found = read_folder(folder, settings)
     return _Source(

@@ -138,7 +138,11 @@ struct Pixels {
                    int64_t bytes) {
     const double share = 1.0 / static_cast<double>(whole);
     for (int64_t g = 0; g < pixels; g += GROUP) {
-      bright[g / GROUP] = ramp.begin<ramps, carry>(g, GROUP, share);
+      bright[g / GROUP] = ramp.reaches_one(g, GROUP);
+      if (carry || bright[g / GROUP])
+        ramp.begin<ramps, true>(g, GROUP, share);
+      else
+        ramp.begin<ramps, false>(g, GROUP, share);
       if (ramps) ramp.skip(g, GROUP, done);
     }
     for (int64_t t = 0; t < ticks; t += TICKS) {

@@ -22,24 +22,22 @@ inline Longs ceiling(Doubles x) {
   return as_int(rounded) - (Longs)((rounded - ROUND) < x);
 }
 
-// V0 and D of eight, four or two pixels: whole units, and 2^-32 of a unit in the low words. `ends` has every bit that
-// the light at either end has.
+// V0 and D of eight, four or two pixels: whole units, and 2^-32 of a unit in the low words.
 struct Slope {
-  Longs v, v_low, d, d_low, ends;
+  Longs v, v_low, d, d_low;
 };
 
 template <bool ramp>
 inline Slope slope(const float *from, const float *to, double share) {
   const Doubles a = load_doubles(from) * UNIT + ROUND;
-  if (!ramp) return {as_int(a), Longs{}, Longs{}, Longs{}, as_int(a)};
+  if (!ramp) return {as_int(a), Longs{}, Longs{}, Longs{}};
   const Doubles b = load_doubles(to) * UNIT + ROUND;
   const Doubles d = (b - a) * share, half = d * 0.5;
   const Doubles whole = d + ROUND, half_whole = half + ROUND;
   const Longs low = ceiling((d - (whole - ROUND)) * UNIT);
   const Longs half_low = ceiling((half - (half_whole - ROUND)) * UNIT);
   // low parts lie in [-2^31, 2^31]: a negative one borrows a whole unit
-  return {as_int(a) + as_int(half_whole) - (half_low >> 63), half_low, as_int(whole) - (low >> 63), low,
-          as_int(a) | as_int(b)};
+  return {as_int(a) + as_int(half_whole) - (half_low >> 63), half_low, as_int(whole) - (low >> 63), low};
 }
 
 struct Ramp {
@@ -49,29 +47,26 @@ struct Ramp {
   alignas(64) int32_t v_whole[PIXELS], d_whole[PIXELS];
   alignas(64) uint32_t v_word[PIXELS], d_word[PIXELS], v_low[PIXELS], d_low[PIXELS];
 
-  // Sets n pixels from i on up; returns whether one is at or above one threshold a tick. Without `always` whole
-  // thresholds are only set then.
-  template <bool ramp, bool always>
-  bool begin(int64_t i, int64_t n, double share) {
-    Longs ends{};
+  // Whether one of n pixels from i on reaches one threshold a tick. (A float32 below one is below it by 2^-24.)
+  bool reaches_one(int64_t i, int64_t n) const {
+    int32_t any = 0;
+    for (int64_t p = i; p < i + n; ++p) any |= (from[p] >= 1.0f) | (to[p] >= 1.0f);
+    return any != 0;
+  }
+
+  // Sets n pixels from i on up; whole thresholds only if asked for.
+  template <bool ramp, bool whole>
+  void begin(int64_t i, int64_t n, double share) {
     for (int64_t p = i; p < i + n; p += DOUBLES) {
       const Slope s = slope<ramp>(from + p, to + p, share);
-      ends |= s.ends;
       store_low(v_word + p, s.v);
       store_low(v_low + p, s.v_low);
       store_low(d_word + p, s.d);
       store_low(d_low + p, s.d_low);
-    }
-    uint64_t either = 0;
-    for (int k = 0; k < DOUBLES; ++k) either |= ends[k];
-    const bool bright = (either >> 32) != 0;
-    if (!always && !bright) return false;
-    for (int64_t p = i; p < i + n; p += DOUBLES) {
-      const Slope s = slope<ramp>(from + p, to + p, share);
+      if (!whole) continue;
       store_low(reinterpret_cast<uint32_t *>(v_whole + p), s.v >> 32);
       store_low(reinterpret_cast<uint32_t *>(d_whole + p), s.d >> 32);
     }
-    return bright;
   }
 
   // Goes some ticks on. Whole thresholds come out right where they were set.

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from spikerig.rigctl.sim.effects import Floats, Hooks
-from spikerig.rigctl.sim.facts import SLACK, Bound, Facts
+from spikerig.rigctl.sim.judge.facts import SLACK, Bound, Facts
 from spikerig.rigctl.sim.rgb import window_weights
 
 NEAR = 0.8  # light that optics may raise beyond one threshold a tick

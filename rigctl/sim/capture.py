@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.outfile import refuse_existing
+from spikerig.rigctl.sim.caster.light import Stage, stage_of
 from spikerig.rigctl.sim.effects import parameters
-from spikerig.rigctl.sim.light import Stage, stage_of
-from spikerig.rigctl.sim.plan import Plan, plan, resolve
+from spikerig.rigctl.sim.judge.plan import Plan, plan, resolve
 from spikerig.rigctl.sim.schedule import Track, schedule, track_phases
 from spikerig.rigctl.sim.spec import SceneSpec
 from spikerig.rigctl.sim.take import Rig, Taken, pack, share_of, surface, take_blurry, take_sharp, true_clock

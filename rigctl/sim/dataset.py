@@ -18,8 +18,8 @@ from spikerig.dataset.errors import DataError, HostError, UsageError
 from spikerig.dataset.terminal import jsonable
 from spikerig.rigctl.sim.capture import provenance, rig_of, settled
 from spikerig.rigctl.sim.farm import Cluster, fill, finished
+from spikerig.rigctl.sim.judge.plan import Plan
 from spikerig.rigctl.sim.limits import nearest
-from spikerig.rigctl.sim.plan import Plan
 from spikerig.rigctl.sim.sheet import contact_sheet, overview
 from spikerig.rigctl.sim.shelf import Shelf, alone, differences, fingerprint, write_whole
 from spikerig.rigctl.sim.spec import SceneSpec, builtin_names, load_scene_toml, with_changes

@@ -106,7 +106,7 @@ def read_record(cls: type[R], table: Any, where: str, faults: Faults, defaults: 
 def _range(spec: dataclasses.Field) -> str:
     meta = spec.metadata
     if meta.get("choices"):
-        return f", expected one of {', '.join(meta['choices'])}"
+        return f", expected one of {', '.join(filter(None, meta['choices']))}"
     unit = f" {meta['unit']}" if meta.get("unit") else ""
     lo, hi = meta.get("lo", -math.inf), meta.get("hi", math.inf)
     if lo == -math.inf and hi == math.inf:

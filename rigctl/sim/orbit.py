@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from spikerig.rigctl.sim.caster.world import Vec3
 from spikerig.rigctl.sim.limits import limits
-from spikerig.rigctl.sim.world import Vec3
 
 Floats = NDArray[np.float64]
 

@@ -7,12 +7,11 @@ import math
 import re
 from typing import Any
 
-from spikerig.rigctl.sim.effects import EFFECTS, effect_class
+from spikerig.rigctl.sim.caster.pattern import Texture
+from spikerig.rigctl.sim.caster.world import KINDS, Air, Lamp
 from spikerig.rigctl.sim.events import EventCamera
 from spikerig.rigctl.sim.orbit import Orbit
-from spikerig.rigctl.sim.pattern import Texture
 from spikerig.rigctl.sim.spec import PAPER, Cloud, Exposure, Lens, RgbCamera, Sensor, Shake, Tolerance
-from spikerig.rigctl.sim.world import KINDS, Air, Lamp
 
 TABLES: tuple[tuple[str, type], ...] = (
     ("camera", Lens),
@@ -37,7 +36,8 @@ says *required*. Unknown keys, wrong types and values out of range are told all 
 At the top: `name`; `seed` (of shake, noise and points; the world has its own seeds and does not change with it);
 `effects`, a list of names or of tables `{ name = "...", parameter = value }`, each at most once; or the word `"auto"`,
 which takes of those to choose from what matters for this scene, or `"all"` of them. To choose from are the effects of
-the presets, and those listed in `consider` (same form), whose parameters go before a preset's.
+the presets, and those listed in `consider` (same form), whose parameters go before a preset's. `spikerig sim effects`
+says of a scene file which matter, and why: [effects.md](effects.md).
 
 World axes: z up, right-handed. All light and reflectances are linear, 1.0 is display white.
 """
@@ -47,35 +47,20 @@ def page() -> str:
     """The whole page."""
     parts = [HEAD]
     for name, record in TABLES:
-        parts.append(f"## `[{name}]`\n\n{_about(record)}{_rows(record)}")
+        parts.append(f"## `[{name}]`\n\n{about(record)}{rows(record)}")
     preset = ", ".join(f"`{k} = {_value(v)}`" for k, v in PAPER.items())
     parts.append(f'`protocol = "paper"` changes these defaults: {preset}, `sensor.gain = 0.5`.\n')
-    parts.append("## `[world]`\n\n" + _about(Air) + _rows(Air))
+    parts.append("## `[world]`\n\n" + about(Air) + rows(Air))
     for kind, record in KINDS.items():
-        parts.append(f'### `[[world.solids]]`, `kind = "{kind}"`\n\n{_about(record)}{_rows(record)}')
+        parts.append(f'### `[[world.solids]]`, `kind = "{kind}"`\n\n{about(record)}{rows(record)}')
     parts.append(
-        f"### Textures: `texture`, `floor`, `ceiling`, `walls`, `bark`, `leaf`\n\n{_about(Texture)}{_rows(Texture)}"
+        f"### Textures: `texture`, `floor`, `ceiling`, `walls`, `bark`, `leaf`\n\n{about(Texture)}{rows(Texture)}"
     )
-    parts.append(
-        "## Effects\n\nThey act in this order. Each draws from its own random stream of (seed, name, view).\n"
-        "Blur by motion is none of them: it is the exposure itself, `[exposure]` and `[shake]`.\n"
-    )
-    for name in EFFECTS:
-        effect: Any = effect_class(name)
-        parts.append(
-            f"### `{name}`\n\n{_about(effect)}{_rows(effect)}\n"
-            f"- Stage: {effect.stage.name}\n- Vanishes: {effect.vanishes}\n- Source: {effect.source}\n"
-            f"- Bound on the change: {_first(effect.magnitude.__doc__)}\n"
-            f"- Cost: about {effect.cost_ns:g} ns a pixel and {effect.per}\n"
-        )
+    parts.append("## Effects\n\nThey have a page of their own: [effects.md](effects.md).\n")
     return "\n".join(part.rstrip("\n") + "\n" for part in parts)
 
 
-def _first(doc: str | None) -> str:
-    return (doc or "").strip().splitlines()[0].rstrip(".")
-
-
-def _about(record: type) -> str:
+def about(record: type) -> str:
     """A record's docstring as Markdown: its Args become a list."""
     text, _, args = (record.__doc__ or "").partition("    Args:\n")
     lines = [re.sub(r"^`\[[a-z.]+\]`: ", "", line.strip()) for line in text.strip().splitlines()]
@@ -86,7 +71,8 @@ def _about(record: type) -> str:
     return "\n".join(lines).strip() + "\n\n"
 
 
-def _rows(record: type) -> str:
+def rows(record: type) -> str:
+    """A record's fields as a Markdown table."""
     fields = dataclasses.fields(record)
     if not fields:
         return "No parameters.\n"

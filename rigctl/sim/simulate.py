@@ -81,14 +81,14 @@ def simulate(
     own_arm = light.arm is not None
     site = Site(height, width, view, seed, light.rate_hz, light.t0_ns * 1e-9, ticks, camera, own_arm)
     steps = [effect.begin(site) for effect in in_order(effects)]
-    light = _lit(light, steps)
+    light = lit(light, steps)
     spikes, start, left, clipped = _spikes(light, sensor, steps)
     frame, blurry = _frame(light, steps)
     seen = None if events is None else _events(light, sensor, steps, events, seed, view)
     return Simulated(spikes, frame, blurry, start, left, clipped, seen)
 
 
-def _lit(light: Light, steps: Sequence[Hooks]) -> Light:
+def lit(light: Light, steps: Sequence[Hooks]) -> Light:
     """The light after what happens to it before the arms part."""
     changes = [h.radiance for h in steps if h.radiance is not None]
     if not changes:

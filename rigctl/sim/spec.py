@@ -14,12 +14,12 @@ import numpy as np
 
 from spikerig.dataset.bayer import PATTERNS, Bayer
 from spikerig.dataset.errors import UsageError
+from spikerig.rigctl.sim.caster.world import Vec3, World, read_world, stands_in
 from spikerig.rigctl.sim.effects import Effect, effect_class, in_order, read_effects, settled
 from spikerig.rigctl.sim.events import EventCamera
 from spikerig.rigctl.sim.limits import Faults, limits, nearest, read_record
 from spikerig.rigctl.sim.orbit import Orbit, orbit_pose
 from spikerig.rigctl.sim.presets import PRESETS, preset_effects, preset_names
-from spikerig.rigctl.sim.world import Vec3, World, read_world, stands_in
 
 
 @dataclass(frozen=True, slots=True)

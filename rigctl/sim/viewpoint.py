@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from spikerig.dataset.scene import Camera
+from spikerig.rigctl.sim.caster.light import Stage
 from spikerig.rigctl.sim.draws import stream
-from spikerig.rigctl.sim.light import Stage
+from spikerig.rigctl.sim.judge.samples import motion_px, sampled
 from spikerig.rigctl.sim.orbit import orbit_pose, target_depth
-from spikerig.rigctl.sim.samples import motion_px, sampled
 from spikerig.rigctl.sim.shake import ShakePath, shake_path
 from spikerig.rigctl.sim.spec import Exposure, SceneSpec
 

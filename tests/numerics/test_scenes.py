@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from spikerig.dataset.scene import Camera
-from spikerig.rigctl.sim.crowd import Crowd, bounds
-from spikerig.rigctl.sim.grow import parts_of
-from spikerig.rigctl.sim.light import Stage
+from spikerig.rigctl.sim.caster.crowd import Crowd, bounds
+from spikerig.rigctl.sim.caster.grow import parts_of
+from spikerig.rigctl.sim.caster.light import Stage
+from spikerig.rigctl.sim.caster.parts import meet
+from spikerig.rigctl.sim.caster.pattern import Texture
+from spikerig.rigctl.sim.caster.solids import Bricks, Cylinder, Ellipsoid, Rect, Room, Scatter, Sphere
+from spikerig.rigctl.sim.caster.world import Lamp, World
 from spikerig.rigctl.sim.orbit import Orbit, orbit_pose
-from spikerig.rigctl.sim.parts import meet
-from spikerig.rigctl.sim.pattern import Texture
-from spikerig.rigctl.sim.solids import Bricks, Cylinder, Ellipsoid, Rect, Room, Scatter, Sphere
-from spikerig.rigctl.sim.world import Lamp, World
 
 WHITE = Texture(a=(1, 1, 1))
 HERE = np.eye(3, 4)
@@ -76,7 +76,7 @@ def test_parts_around_the_camera() -> None:
     every, face = np.full((30, 40), np.inf, np.float32), np.full((30, 40), -1, np.int32)
     with pytest.MonkeyPatch.context() as patch:
         wide = (np.full((400, 2), -np.inf), np.full((400, 2), np.inf))
-        patch.setattr("spikerig.rigctl.sim.crowd.bounds", lambda *_: wide)
+        patch.setattr("spikerig.rigctl.sim.caster.crowd.bounds", lambda *_: wide)
         crowd.hit(HERE, x, y, every, face)
     assert np.array_equal(every, depth)
 

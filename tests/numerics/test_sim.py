@@ -11,9 +11,9 @@ from spikerig.dataset.errors import NumericsError
 from spikerig.dataset.kernels import count
 from spikerig.dataset.scene import Camera
 from spikerig.rigctl.sim.capture import take_view, view_path
+from spikerig.rigctl.sim.caster.light import Stage
 from spikerig.rigctl.sim.effects import Hooks, Site
 from spikerig.rigctl.sim.effects.shot import ShotNoise
-from spikerig.rigctl.sim.light import Stage
 from spikerig.rigctl.sim.orbit import target_depth
 from spikerig.rigctl.sim.sensor import Light, integrate
 from spikerig.rigctl.sim.shake import path_px

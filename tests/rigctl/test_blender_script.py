@@ -13,7 +13,7 @@ import pytest
 
 from spikerig.dataset.cli import run
 from spikerig.dataset.store import open_scene
-from spikerig.rigctl.sim.folder import read_folder
+from spikerig.rigctl.sim.sources.folder import read_folder
 
 SCRIPT = Path(__file__).resolve().parents[2] / "docs" / "blender" / "render_rs3d.py"
 WIDTH, HEIGHT, LENS = 24, 15, 30.0

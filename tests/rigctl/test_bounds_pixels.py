@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import lru_cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,15 +10,15 @@ import pytest
 
 from spikerig.dataset.kernels import count
 from spikerig.rigctl.sim.capture import camera_of, view_path
+from spikerig.rigctl.sim.caster.light import stage_of
 from spikerig.rigctl.sim.effects import effect_class
 from spikerig.rigctl.sim.effects.phase import InitialPhase
-from spikerig.rigctl.sim.facts import PART, SLACK, Facts, surplus
-from spikerig.rigctl.sim.light import stage_of
+from spikerig.rigctl.sim.judge.facts import PART, SLACK, Facts, surplus
+from spikerig.rigctl.sim.judge.survey import Look, survey
 from spikerig.rigctl.sim.schedule import schedule, start_ns
 from spikerig.rigctl.sim.sensor import Light
 from spikerig.rigctl.sim.simulate import simulate
 from spikerig.rigctl.sim.spec import SceneSpec, load_scene_toml
-from spikerig.rigctl.sim.survey import Look, survey
 
 WIDTH, HEIGHT = 80, 50
 # gain, pixels of motion, exposure ms, margin ticks
@@ -126,7 +127,7 @@ def test_counts_of_charge_with_even_phases(change: float, before: float) -> None
     phases = rng.random((2, 400_000))
     start = SLACK * before
     moved = np.abs(np.floor(phases[0] + start + SLACK * change) - np.floor(phases[1] + start))
-    nobody: Any = None
+    nobody: Any = SimpleNamespace(size=(10**9, 10**9))  # so many pixels that shares do not scatter
     got = Facts.counted(nobody, np.full(9, change), np.full(9, before))
     if got < 1:
         assert np.mean(moved > 0) / 0.05 == pytest.approx(got, abs=0.02)
@@ -136,7 +137,7 @@ def test_counts_of_charge_with_even_phases(change: float, before: float) -> None
 
 
 def test_a_share_that_changes() -> None:
-    nobody: Any = None
+    nobody: Any = SimpleNamespace(size=(10**9, 10**9))  # so many pixels that shares do not scatter
     change = np.full(10, 3.0)
     assert Facts.counted(nobody, change, share=0.2) == 4  # 3.75 with the slack: three or four
     assert Facts.counted(nobody, change, share=0.01) == pytest.approx(0.2)
@@ -148,3 +149,14 @@ def test_light_beyond_a_spike_a_tick() -> None:
     """Even from 0.5 to 1.5 an eighth is beyond one; steady light its excess; short peaks no more than they hold."""
     got = surplus(np.array([1.0, 0.4, 1.7, 0.1, 2.0]), np.array([1.5, 0.4, 1.7, 10.0, 3.0]))
     assert got == pytest.approx([0.125, 0, 0.7, 0.1 * 0.81, 1.0])
+
+
+def test_shares_of_a_small_picture_scatter() -> None:
+    """Three standard deviations of how many of its pixels change; more where they change together, as rows do."""
+    small: Any = SimpleNamespace(size=(64, 100))
+    share = 0.0005
+    once = Facts.counted(small, np.ones(10), share=share)
+    assert once == pytest.approx((share + 3 * np.sqrt(share / 6400)) / 0.05)
+    rng = np.random.default_rng(2)
+    assert np.mean(rng.binomial(6400, share, 10_000) / 6400 / 0.05 > once) < 0.01
+    assert Facts.counted(small, np.ones(10), share=share, together=16) > 2 * once

@@ -14,7 +14,7 @@ from spikerig.dataset.scene import Scene
 from spikerig.dataset.store import open_scene, verify_scene
 from spikerig.rigctl.sim import farm
 from spikerig.rigctl.sim.capture import camera_of, capture, take_view, view_path
-from spikerig.rigctl.sim.light import Stage
+from spikerig.rigctl.sim.caster.light import Stage
 from spikerig.rigctl.sim.rgb import encode
 from spikerig.rigctl.sim.spec import SceneSpec
 from spikerig.rigctl.sim.take import in_parallel, share_of

@@ -17,10 +17,10 @@ from spikerig.rigctl.sim.effects.fpn import ThresholdFpn
 from spikerig.rigctl.sim.effects.phase import InitialPhase
 from spikerig.rigctl.sim.effects.read import ReadNoise
 from spikerig.rigctl.sim.effects.shot import ShotNoise
+from spikerig.rigctl.sim.judge.survey import Look, survey
 from spikerig.rigctl.sim.sensor import Light
 from spikerig.rigctl.sim.simulate import Simulated, simulate
 from spikerig.rigctl.sim.spec import Exposure, Sensor
-from spikerig.rigctl.sim.survey import Look, survey
 
 ALL = [ShotNoise(), DarkCurrent(), ThresholdFpn(), InitialPhase(), ReadNoise()]
 

@@ -14,9 +14,9 @@ from spikerig.rigctl.sim.effects.phase import InitialPhase
 from spikerig.rigctl.sim.effects.read import ReadNoise
 from spikerig.rigctl.sim.effects.response import ResponseCurve
 from spikerig.rigctl.sim.effects.rolling import RollingShutter
+from spikerig.rigctl.sim.judge.survey import Look, survey
 from spikerig.rigctl.sim.sensor import Light
 from spikerig.rigctl.sim.spec import Exposure, Sensor
-from spikerig.rigctl.sim.survey import Look, survey
 
 ABSENT = [
     RollingShutter(0.0),

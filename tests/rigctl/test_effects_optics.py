@@ -12,6 +12,8 @@ from spikerig.dataset.errors import UsageError
 from spikerig.dataset.kernels import count
 from spikerig.dataset.scene import Camera
 from spikerig.rigctl.sim.capture import take_view
+from spikerig.rigctl.sim.caster.light import Stage
+from spikerig.rigctl.sim.caster.world import read_world
 from spikerig.rigctl.sim.effects import Effect
 from spikerig.rigctl.sim.effects.defocus import Defocus
 from spikerig.rigctl.sim.effects.distortion import Distortion
@@ -20,10 +22,8 @@ from spikerig.rigctl.sim.effects.ghost import Ghost
 from spikerig.rigctl.sim.effects.misalignment import Misalignment
 from spikerig.rigctl.sim.effects.splitter import Splitter
 from spikerig.rigctl.sim.effects.vignetting import Vignetting
-from spikerig.rigctl.sim.light import Stage
 from spikerig.rigctl.sim.limits import Faults
 from spikerig.rigctl.sim.warp import bent, blurred, plane_map, resampler, shift_map, straight
-from spikerig.rigctl.sim.world import read_world
 
 ABSENT = [
     Splitter(0.5, 0.0),

@@ -18,11 +18,11 @@ from spikerig.dataset.texture import tfp
 from spikerig.rigctl.sim.capture import capture, rig_of, take_view
 from spikerig.rigctl.sim.effects import Hooks
 from spikerig.rigctl.sim.events import EventCamera, simulate_events
+from spikerig.rigctl.sim.judge.survey import Look, survey
 from spikerig.rigctl.sim.sensor import Light, spike_light
 from spikerig.rigctl.sim.shelf import dumps, loads
 from spikerig.rigctl.sim.simulate import simulate
 from spikerig.rigctl.sim.spec import Exposure, Sensor, read_scene
-from spikerig.rigctl.sim.survey import Look, survey
 
 
 def smooth_light(seed: int = 0, height: int = 14, width: int = 19) -> Light:
@@ -104,8 +104,8 @@ def test_a_captured_scene_holds_its_events(tmp_path: Path) -> None:
 
 
 def test_pictures_from_elsewhere_have_events_too(tmp_path: Path) -> None:
-    from spikerig.rigctl.sim.folder import read_folder
-    from spikerig.rigctl.sim.frames import capture_folder
+    from spikerig.rigctl.sim.sources.folder import read_folder
+    from spikerig.rigctl.sim.sources.frames import capture_folder
 
     frames = []
     for k in range(3):

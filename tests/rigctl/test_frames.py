@@ -14,13 +14,13 @@ from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.images import read_image, srgb_from_linear, write_image
 from spikerig.dataset.store import open_scene
 from spikerig.rigctl.sim.capture import camera_of, view_path
-from spikerig.rigctl.sim.folder import read_folder
-from spikerig.rigctl.sim.frames import capture_folder
-from spikerig.rigctl.sim.light import Stage
-from spikerig.rigctl.sim.pictures import mend
-from spikerig.rigctl.sim.points import read_points
+from spikerig.rigctl.sim.caster.light import Stage
 from spikerig.rigctl.sim.sensor import Light
 from spikerig.rigctl.sim.simulate import simulate
+from spikerig.rigctl.sim.sources.folder import read_folder
+from spikerig.rigctl.sim.sources.frames import capture_folder
+from spikerig.rigctl.sim.sources.pictures import mend
+from spikerig.rigctl.sim.sources.points import read_points
 
 PHASES = np.linspace(0, 1, 5)
 SETTINGS = 'seed = 4\neffects = ["shot_noise", "read_noise"]\n[exposure]\nexposure_ms = 1\n[points]\ncount = 50\n'

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from spikerig.dataset.scene import Camera
-from spikerig.rigctl.sim import crowd as crowd_module
-from spikerig.rigctl.sim.crowd import Crowd
-from spikerig.rigctl.sim.gloss import exponent, fresnel, highlight
-from spikerig.rigctl.sim.grow import parts_of
-from spikerig.rigctl.sim.light import Stage
+from spikerig.rigctl.sim.caster import crowd as crowd_module
+from spikerig.rigctl.sim.caster.crowd import Crowd
+from spikerig.rigctl.sim.caster.gloss import exponent, fresnel, highlight
+from spikerig.rigctl.sim.caster.grow import parts_of
+from spikerig.rigctl.sim.caster.light import Stage
+from spikerig.rigctl.sim.caster.pattern import DIVES, SIDES, Texture, albedo, lattice
+from spikerig.rigctl.sim.caster.shade import CrowdMap, irradiance
+from spikerig.rigctl.sim.caster.solids import Cylinder, Ellipsoid, Rect, Room, Scatter, Solid, Sphere
+from spikerig.rigctl.sim.caster.world import Lamp, World
 from spikerig.rigctl.sim.orbit import Orbit, orbit_pose
-from spikerig.rigctl.sim.pattern import DIVES, SIDES, Texture, albedo, lattice
-from spikerig.rigctl.sim.shade import CrowdMap, irradiance
-from spikerig.rigctl.sim.solids import Cylinder, Ellipsoid, Rect, Room, Scatter, Solid, Sphere
-from spikerig.rigctl.sim.world import Lamp, World
 
 WHITE = Texture(a=(1, 1, 1))
 DARK = Lamp()
@@ -122,7 +122,7 @@ def test_bits_do_not_depend_on_how_pairs_are_cut(monkeypatch: pytest.MonkeyPatch
     camera, pose = Camera.pinhole(40, 26, 50), orbit_pose(Orbit(views=1, radius=2.0, height=0.5), 0)
     whole = Stage(world).picture(camera, pose, 2)
     monkeypatch.setattr(crowd_module, "PAIRS", 997)
-    monkeypatch.setattr("spikerig.rigctl.sim.light.BAND", 1000)
+    monkeypatch.setattr("spikerig.rigctl.sim.caster.light.BAND", 1000)
     assert np.array_equal(Stage(world).picture(camera, pose, 2), whole)
 
 

@@ -5,11 +5,11 @@ import pytest
 from hard_sim import small
 
 from spikerig.dataset.scene import Camera
-from spikerig.rigctl.sim.light import Stage
+from spikerig.rigctl.sim.caster.light import Stage
+from spikerig.rigctl.sim.caster.pattern import Texture, albedo, lattice
+from spikerig.rigctl.sim.caster.shade import irradiance
+from spikerig.rigctl.sim.caster.world import Box, Lamp, Rect, Room, Sphere, World
 from spikerig.rigctl.sim.orbit import Orbit, orbit_pose
-from spikerig.rigctl.sim.pattern import Texture, albedo, lattice
-from spikerig.rigctl.sim.shade import irradiance
-from spikerig.rigctl.sim.world import Box, Lamp, Rect, Room, Sphere, World
 
 
 def nearest_hit(world: World, o: np.ndarray, d: np.ndarray) -> float:

@@ -14,9 +14,9 @@ from spikerig.dataset.cli import run
 from spikerig.dataset.errors import DataError, HostError, UsageError
 from spikerig.dataset.images import read_image
 from spikerig.dataset.store import open_scene
-from spikerig.rigctl.sim import mitsuba_scene as module
 from spikerig.rigctl.sim.capture import camera_of, view_path
-from spikerig.rigctl.sim.mitsuba_scene import capture_toml, plan_scene, render_folder
+from spikerig.rigctl.sim.sources import mitsuba_scene as module
+from spikerig.rigctl.sim.sources.mitsuba_scene import capture_toml, plan_scene, render_folder
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "mitsuba"
 BALL = """<scene version="3.0.0">

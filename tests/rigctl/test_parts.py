@@ -8,15 +8,15 @@ import pytest
 
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.scene import Camera
-from spikerig.rigctl.sim.crowd import Crowd, pieces, runs
-from spikerig.rigctl.sim.grow import parts_of
-from spikerig.rigctl.sim.light import Stage
+from spikerig.rigctl.sim.caster.crowd import Crowd, pieces, runs
+from spikerig.rigctl.sim.caster.grow import parts_of
+from spikerig.rigctl.sim.caster.light import Stage
+from spikerig.rigctl.sim.caster.parts import SIDES, Parts, holds, inner_normal, meet, place, surface
+from spikerig.rigctl.sim.caster.pattern import Texture
+from spikerig.rigctl.sim.caster.solids import Box, Bricks, Cylinder, Ellipsoid, Plant, Rect, Scatter, Sphere
+from spikerig.rigctl.sim.caster.world import Lamp, World
 from spikerig.rigctl.sim.orbit import Orbit, orbit_pose
-from spikerig.rigctl.sim.parts import SIDES, Parts, holds, inner_normal, meet, place, surface
-from spikerig.rigctl.sim.pattern import Texture
-from spikerig.rigctl.sim.solids import Box, Bricks, Cylinder, Ellipsoid, Plant, Rect, Scatter, Sphere
 from spikerig.rigctl.sim.spec import load_scene_toml, read_scene
-from spikerig.rigctl.sim.world import Lamp, World
 
 WHITE = Texture(a=(1, 1, 1))
 SHAPES = sorted(SIDES)

@@ -19,11 +19,11 @@ from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.images import linear_from_srgb, read_image, write_image
 from spikerig.dataset.kernels import unpack
 from spikerig.dataset.spikes import open_spikes
-from spikerig.rigctl.sim import retake as module
-from spikerig.rigctl.sim.moving import Look, Moving, open_moving
-from spikerig.rigctl.sim.retake import Exposures, Retake, knots, spikes_of
 from spikerig.rigctl.sim.rgb import encode
 from spikerig.rigctl.sim.sensor import spike_light
+from spikerig.rigctl.sim.sources import retake as module
+from spikerig.rigctl.sim.sources.moving import Look, Moving, open_moving
+from spikerig.rigctl.sim.sources.retake import Exposures, Retake, knots, spikes_of
 from spikerig.rigctl.sim.spec import Sensor
 
 RNG = np.random.default_rng(0)

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from spikerig.dataset.errors import DataError, HostError, UsageError
-from spikerig.rigctl.sim.moving import Look, fitted, open_moving
-from spikerig.rigctl.sim.video import linear_from, open_video
+from spikerig.rigctl.sim.sources.moving import Look, fitted, open_moving
+from spikerig.rigctl.sim.sources.video import linear_from, open_video
 
 RED = np.array([0.8, 0.3, 0.1])  # encoded
 LUMA = {1: (0.2126, 0.0722), 5: (0.299, 0.114), 9: (0.2627, 0.0593)}
@@ -174,7 +174,7 @@ def test_true_times_of_a_variable_frame_rate(tmp_path: Path) -> None:
 
 
 def test_frames_that_do_not_go_on_in_time_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from spikerig.rigctl.sim import video as module
+    from spikerig.rigctl.sim.sources import video as module
 
     path = write(tmp_path / "v.mkv", [gray(9)] * 2)
     light = np.zeros((16, 32, 3), np.float32)

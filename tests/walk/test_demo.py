@@ -66,7 +66,7 @@ def test_a_failed_step_hands_its_exit_code_and_reason_up(monkeypatch: pytest.Mon
 
 def test_the_report_escapes_what_comes_from_files() -> None:
     row = {"psnr": 1.0, "luma_psnr": 1.0, "ssim": 0.5, "steps": 1, "train_seconds": 1.0}
-    scene = {"methods": {"<script>": row}, **report.gains({}), "pose_label": "<b>"}
+    scene = {"methods": {"<script>": row}, **report.gains({}), "pose_label": "<b>", "plan": "<u>"}
     result = {
         "scenes": {"<i>": scene},
         "seconds": 1.0,

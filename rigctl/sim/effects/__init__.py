@@ -25,7 +25,7 @@ from spikerig.rigctl.sim.limits import Faults, nearest, read_record
 if TYPE_CHECKING:
     from spikerig.dataset.scene import Camera
     from spikerig.dataset.spikes import SpikeStream
-    from spikerig.rigctl.sim.facts import Bound, Facts
+    from spikerig.rigctl.sim.judge.facts import Bound, Facts
 
 Floats = NDArray[np.floating]  # float32 unless said
 

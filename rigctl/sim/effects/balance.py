@@ -7,10 +7,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from spikerig.rigctl.sim.caster.world import Vec3
 from spikerig.rigctl.sim.effects import Floats, Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import Bound, Facts
+from spikerig.rigctl.sim.judge.facts import Bound, Facts
 from spikerig.rigctl.sim.limits import limits
-from spikerig.rigctl.sim.world import Vec3
 
 
 @dataclass(frozen=True, slots=True)

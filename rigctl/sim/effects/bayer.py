@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from spikerig.rigctl.sim.arms import in_views
 from spikerig.rigctl.sim.effects import Floats, Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import Bound, Facts
+from spikerig.rigctl.sim.judge.facts import Bound, Facts
 from spikerig.rigctl.sim.limits import limits
 
 PATTERNS = ("rggb", "bggr", "grbg", "gbrg")

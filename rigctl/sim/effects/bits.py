@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from spikerig.rigctl.sim.effects import Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import Bound, Facts
+from spikerig.rigctl.sim.judge.facts import Bound, Facts
 from spikerig.rigctl.sim.limits import limits
 
 

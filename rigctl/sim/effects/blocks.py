@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.spikes import SpikeStream
 from spikerig.rigctl.sim.effects import Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import Bound, Facts
+from spikerig.rigctl.sim.judge.facts import Bound, Facts
 from spikerig.rigctl.sim.limits import limits
 
 LOOKS = 2000  # exposures tried for the bound

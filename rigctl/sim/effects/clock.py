@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from spikerig.rigctl.sim.draws import stream
 from spikerig.rigctl.sim.effects import Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import Bound, Facts
+from spikerig.rigctl.sim.judge.facts import Bound, Facts
 from spikerig.rigctl.sim.limits import limits
 
 Ahead = Callable[[NDArray[np.int64]], NDArray[np.float64]]

@@ -9,7 +9,7 @@ import numpy as np
 
 from spikerig.rigctl.sim.arms import ARMS, looked_at, on_arm
 from spikerig.rigctl.sim.effects import Floats, Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import Bound, Facts
+from spikerig.rigctl.sim.judge.facts import Bound, Facts
 from spikerig.rigctl.sim.limits import limits
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from spikerig.dataset.spikes import SpikeStream
 from spikerig.rigctl.sim.effects import Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import Bound, Facts
+from spikerig.rigctl.sim.judge.facts import RARE, Bound, Facts
 from spikerig.rigctl.sim.limits import limits
 
 PART = 1 << 20  # bits drawn for at once
@@ -56,4 +56,8 @@ class BitFlips:
         size = facts.normal().shape[1:]
         rng = np.random.default_rng(95)
         change = rng.binomial(facts.ticks - ones, self.chance, size) - rng.binomial(ones, self.chance, size)
-        return Bound(facts.counted(change.astype(np.float64)), 0.0, f"{self.chance:g} x {facts.ticks} bits")
+        spikes = facts.counted(change.astype(np.float64))
+        any_bit = -np.expm1(facts.ticks * np.log1p(-self.chance)) if self.chance < 1 else 1.0
+        if any_bit < RARE:  # too rare for draws
+            spikes = max(spikes, facts.counted(np.ones(1), share=float(any_bit)))
+        return Bound(spikes, 0.0, f"{self.chance:g} x {facts.ticks} bits")

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from spikerig.rigctl.sim.effects import Floats, Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import Bound, Facts
+from spikerig.rigctl.sim.judge.facts import Bound, Facts
 from spikerig.rigctl.sim.limits import limits
 
 

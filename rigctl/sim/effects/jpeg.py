@@ -12,7 +12,7 @@ from spikerig.dataset.errors import UsageError
 from spikerig.dataset.images import srgb8_from_linear
 from spikerig.rigctl.sim.arms import in_views
 from spikerig.rigctl.sim.effects import Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import Bound, Facts
+from spikerig.rigctl.sim.judge.facts import Bound, Facts
 from spikerig.rigctl.sim.limits import limits
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.errors import DataError
 from spikerig.rigctl.sim.effects import Floats, Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import Bound, Facts, surplus
+from spikerig.rigctl.sim.judge.facts import Bound, Facts, surplus
 from spikerig.rigctl.sim.limits import limits
 
 MOST_PIXELS = 1 << 26

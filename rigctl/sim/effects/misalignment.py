@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.errors import UsageError
 from spikerig.rigctl.sim.arms import in_views, moved
+from spikerig.rigctl.sim.caster.world import Vec3
 from spikerig.rigctl.sim.effects import Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import Bound, Facts
+from spikerig.rigctl.sim.judge.facts import Bound, Facts
 from spikerig.rigctl.sim.limits import limits
 from spikerig.rigctl.sim.warp import plane_map, resampler
-from spikerig.rigctl.sim.world import Vec3
 
 CAST = 1.6  # pictures cast anew differ by more than redrawn, softened ones: fine detail falls elsewhere
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.rigctl.sim.effects import Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import Bound, Facts
+from spikerig.rigctl.sim.judge.facts import Bound, Facts
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.rigctl.sim.effects import Floats, Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import Bound, Facts
+from spikerig.rigctl.sim.judge.facts import Bound, Facts
 from spikerig.rigctl.sim.limits import limits
 
 PIXELS = 4000  # that the bound is computed from

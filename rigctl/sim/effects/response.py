@@ -9,7 +9,7 @@ import numpy as np
 
 from spikerig.dataset.images import srgb_from_linear
 from spikerig.rigctl.sim.effects import Floats, Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import Bound, Facts
+from spikerig.rigctl.sim.judge.facts import Bound, Facts
 from spikerig.rigctl.sim.limits import limits
 
 PROTUNE = 113.0  # base of GoPro's log curve

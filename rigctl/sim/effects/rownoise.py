@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.rigctl.sim.effects import Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import Bound, Facts
+from spikerig.rigctl.sim.judge.facts import Bound, Facts
 from spikerig.rigctl.sim.limits import limits
 
 
@@ -61,4 +61,5 @@ class RowNoise:
         if self.mode == "repeat":
             change += rng.poisson(mean * (1 - facts.rate), size)
         counts = facts.most(facts.counts)
-        return Bound(facts.counted(change), 0.0, f"Poisson({self.chance:g} x {counts:.3g} spikes)")
+        hit = max(float(facts.rate.mean()) * facts.size[1], 1.0)  # pixels of a row that lose a spike at once
+        return Bound(facts.counted(change, together=hit), 0.0, f"Poisson({self.chance:g} x {counts:.3g} spikes)")

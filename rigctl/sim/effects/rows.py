@@ -11,7 +11,7 @@ from spikerig.dataset.errors import UsageError
 from spikerig.dataset.spikes import SpikeStream
 from spikerig.rigctl.sim.draws import stream as draws
 from spikerig.rigctl.sim.effects import Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import Bound, Facts
+from spikerig.rigctl.sim.judge.facts import Bound, Facts
 from spikerig.rigctl.sim.limits import limits
 
 

@@ -12,7 +12,7 @@ from spikerig.dataset.errors import HostError
 from spikerig.rigctl.sim.arms import in_views
 from spikerig.rigctl.sim.effects import Hooks, Site, Stage
 from spikerig.rigctl.sim.effects.jpeg import coding_loss
-from spikerig.rigctl.sim.facts import Bound, Facts
+from spikerig.rigctl.sim.judge.facts import Bound, Facts
 from spikerig.rigctl.sim.limits import limits
 
 WORST = 51  # the coarsest quantiser

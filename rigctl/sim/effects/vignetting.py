@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from spikerig.dataset.errors import UsageError
 from spikerig.rigctl.sim.arms import ARMS, on_arm
 from spikerig.rigctl.sim.effects import Floats, Hooks, Site, Stage
-from spikerig.rigctl.sim.facts import Bound, Facts
+from spikerig.rigctl.sim.judge.facts import Bound, Facts
 from spikerig.rigctl.sim.limits import limits
 
 

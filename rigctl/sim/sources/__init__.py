@@ -1,0 +1,1 @@
+"""Light from elsewhere: folders of pictures, videos, Mitsuba scenes."""

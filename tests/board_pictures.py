@@ -1,0 +1,106 @@
+"""Exact pictures of a checkerboard, by casting rays through a known lens; and what a spike sensor makes of them."""
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+
+from spikerig.calib.bundle import turn
+from spikerig.calib.lens import directions, project
+from spikerig.dataset.kernels import fire
+from spikerig.dataset.scene import Camera
+from spikerig.dataset.spikes import SpikeStream
+
+COLS, ROWS, SQUARE = 9, 6, 16.0  # mm
+
+
+def corners(cols: int = COLS, rows: int = ROWS, square: float = SQUARE) -> np.ndarray:
+    """float64[N,3], row by row, about the middle."""
+    xy = np.stack(np.meshgrid(np.arange(cols), np.arange(rows)), -1).reshape(-1, 2) * square
+    return np.concatenate([xy - xy.mean(0), np.zeros((len(xy), 1))], 1)
+
+
+@dataclass
+class Lens:
+    """A camera that casts `samples` x `samples` rays a pixel; their directions are found once.
+
+    The rays lie staggered, all at different heights and all in different columns, so that an edge along the pixels
+    is as exact as any other.
+    """
+
+    camera: Camera
+    samples: int = 4
+    rays: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        s, cam = self.samples, self.camera
+        i, j = np.meshgrid(np.arange(s), np.arange(s))
+        px = np.stack([(i + (j + 0.5) / s) / s, (j + (i + 0.5) / s) / s], -1).reshape(-1, 2)  # within a pixel
+        x, y = np.meshgrid(np.arange(cam.width), np.arange(cam.height))
+        here = np.stack([x, y], -1) + 0.5
+        middle = directions(cam, here)[..., :2]
+        by = [(directions(cam, here + h) - directions(cam, here - h))[..., :2] for h in ([0.5, 0], [0, 0.5])]
+        # within a pixel a lens is straight to 1e-4 px
+        self.rays = np.stack([middle + by[0] * (a - 0.5) + by[1] * (b - 0.5) for a, b in px]).astype(np.float32)
+
+    def picture(self, pose: np.ndarray, black: float = 0.05, white: float = 0.8, behind: float = 0.3,
+                cols: int = COLS, rows: int = ROWS, square: float = SQUARE) -> np.ndarray:  # fmt: skip
+        """Linear light float32[H,W] of a board with a white rim at cam_from_board."""
+        H = np.linalg.inv(np.stack([pose[:, 0], pose[:, 1], pose[:, 3]], 1))  # plane point from direction
+        x, y = self.rays[..., 0], self.rays[..., 1]
+        u, v, w = (np.float32(r[0]) * x + np.float32(r[1]) * y + np.float32(r[2]) for r in H)
+        i, j = (u / w / square + (cols + 1) / 2), (v / w / square + (rows + 1) / 2)
+        dark = (np.floor(i).astype(np.int32) + np.floor(j).astype(np.int32)) & 1
+        light = np.where(dark == 1, np.float32(black), np.float32(white))
+        light[(i < 0) | (i > cols + 1) | (j < 0) | (j > rows + 1)] = white
+        light[(i < -1) | (i > cols + 2) | (j < -1) | (j > rows + 2) | (w <= 0)] = behind
+        return light.mean(0)
+
+    def corners(self, pose: np.ndarray, **board: float) -> np.ndarray:
+        """Where the corners truly are, float64[N,2]."""
+        return project(self.camera, corners(**board) @ pose[:, :3].T + pose[:, 3])
+
+
+@lru_cache
+def lens(arm: str, samples: int, **rig_of: object) -> Lens:
+    """The camera of an arm of `calib_rigs.rig(**rig_of)`, its rays cast once a session."""
+    from calib_rigs import rig
+
+    return Lens(rig(**rig_of).camera(arm), samples)  # type: ignore[arg-type]
+
+
+def poses(count: int, seed: int = 0, tilt_deg: float = 40, near: float = 330, far: float = 620) -> np.ndarray:
+    """spike_from_board float64[V,3,4]: at many depths, tilted about many axes, in every part of the picture.
+
+    The boards' corners lie within 0.31 x 0.185 of the axis, which 400x250 pixels at f = 620 px wholly show.
+    """
+    rng = np.random.default_rng(seed)
+    rim = corners() * [(COLS + 0.6) / (COLS - 1), (ROWS + 0.6) / (ROWS - 1), 1]
+    parts = np.array([[-1, -1], [1, 1], [1, -1], [-1, 1], [0, 0], [-1, 0.2], [1, -0.2]])
+    found: list[np.ndarray] = []
+    for k in range(count):
+        about = 2 * np.pi * (0.38 * k + 0.05 * rng.standard_normal())
+        w = np.radians(tilt_deg) * rng.uniform(0.5, 1) * np.array([np.cos(about), np.sin(about), 0])
+        R = turn(np.array([0, 0, rng.uniform(-0.2, 0.2)])) @ turn(w)
+        z = near + (far - near) * ((0.62 * k + rng.uniform(0, 0.2)) % 1)
+        for out in np.linspace(1, 0, 51):  # as far out as the picture allows
+            t = np.array([*(parts[k % len(parts)] * out * [0.31, 0.185] * z), z])
+            p = rim @ R.T + t
+            if np.all(np.abs(p[:, :2] / p[:, 2:]) < [0.31, 0.185]):
+                break
+        found.append(np.concatenate([R, t[:, None]], 1))
+    return np.stack(found)
+
+
+def spikes(light: np.ndarray, ticks: int, seed: int, *, noisy: bool = True, fpn: float = 0.04) -> SpikeStream:
+    """Integrate and fire, random phase; noisy: threshold FPN (the same for a sensor) and shot noise of 560 e-."""
+    rng = np.random.default_rng([seed, 7])
+    held = light[None].astype(np.float32)
+    phase = rng.integers(0, 2**32, light.shape, dtype=np.uint32)
+    if noisy:
+        held = held / (1 + fpn * np.random.default_rng(99).standard_normal(light.shape)).astype(np.float32)
+        shot = rng.standard_normal((ticks, *light.shape), dtype=np.float32) * np.sqrt(held / 560)
+        bits, _, _ = fire(np.maximum(held + shot, 0), np.arange(ticks + 1), phase, hold=True)
+    else:
+        bits, _, _ = fire(held, np.array([0, ticks]), phase, hold=True)
+    return SpikeStream(bits, light.shape[1], 40_000.0)

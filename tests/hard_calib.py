@@ -1,0 +1,76 @@
+"""Hard inputs of the calibration: lenses, boards, rigs; and the rows that say what must come out."""
+
+import numpy as np
+
+LENSES = {
+    "none": np.zeros(0),
+    "all zero": np.zeros(4),
+    "barrel": np.array([-0.28, 0.06, 1e-3, -2e-3]),
+    "pincushion": np.array([0.2, 0.1, 0, 0, 0.05]),
+    "folding": np.array([-0.6, 0, 0, 0]),
+    "rational, wide": np.array([0.4, 0.1, 1e-4, 5e-4, 0.02, 0.7, 0.2, 0.05]),
+}
+
+
+def bad_records() -> dict[str, bytes]:
+    """Files that claim to be calibrations."""
+    import json
+
+    from calib_rigs import rig
+
+    from spikerig.calib.rig import as_json
+
+    good = as_json(rig())
+    K = good["spike"]["K"]
+
+    def but(**changes: object) -> bytes:
+        return json.dumps({**good, **changes}).encode()
+
+    return {
+        "empty": b"",
+        "no JSON": b"calibration",
+        "not UTF-8": b"\xff\xfe{}",
+        "a list": b"[]",
+        "another schema": but(schema="spikerig.calibration/2"),
+        "no schema": json.dumps({k: v for k, v in good.items() if k != "schema"}).encode(),
+        "nested a hundred thousand deep": b"[" * 100_000,
+        "a NaN": but().replace(b"620.0", b"NaN"),
+        "an infinity": but().replace(b"620.0", b"1e999"),
+        "an integer of 5000 digits": but(residual_px=1).replace(b'"residual_px": 1', b'"residual_px": 1' + b"0" * 5000),
+        "10 MB": but() + b" " * 10_000_000,
+        "a picture of no pixels": but(spike={**good["spike"], "width": 0}),
+        "a picture of 10^12 pixels": but(spike={**good["spike"], "width": 10**12}),
+        "a width that is no integer": but(spike={**good["spike"], "width": 400.5}),
+        "a camera with a text in it": but(spike={**good["spike"], "K": [["620", 0, 0], *K[1:]]}),
+        "a ragged matrix": but(spike={**good["spike"], "K": [[1, 2], *K[1:]]}),
+        "a mirrored camera": but(spike={**good["spike"], "K": [[-620, 0, 200], *K[1:]]}),
+        "seven coefficients": but(spike={**good["spike"], "distortion": [0.1] * 7}),
+        "a million coefficients": but(spike={**good["spike"], "distortion": [0] * 1_000_000}),
+        "a step that is no rotation": but(spike_from_rgb=[[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]),
+        "a step with nothing in it": but(spike_from_rgb=None),
+        "one centre and a baseline": but(spike_from_rgb=[[1, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]]),
+        "depths that are none": but(depth_mm=[1]),
+        "booleans for numbers": but(residual_px=True),
+        "a list for a name": but(mirrored=["rgb"]),
+        "standard deviations that are texts": but(sd={"spike.fx_px": "1"}),
+        "unknown fields": but(colour="red"),
+        "a response of two": but(response=[1, 2]),
+    }
+
+
+_L = "calib/test_lens.py"
+ROWS: list[tuple[str, str, str, str]] = [
+    ("all of `LENSES`: none, folding, rational", "project, directions", "OpenCV's pixels + 0.5, each other's inverse",
+     f"{_L}::test_directions_undo_project_wherever_the_lens_reaches"),
+    ("a polynomial lens beyond its fold", "project, directions", "NaN, not a pixel inside the picture",
+     f"{_L}::test_a_lens_that_folds_is_not_followed_beyond_its_fold"),
+    ("all of `bad_records`: not JSON, NaN, 5000 digits, nested deeply, matrices that are none", "read_calibration",
+     "one DataError", "calib/test_rig.py::test_hostile_records_end_in_one_error"),
+    ("boards that do not tilt at all", "solve, fit_rig", "a huge variance, no exception; refused",
+     "calib/test_optics.py::test_boards_that_barely_tilt_are_refused_however_small_the_residual"),
+    ("an arm mirrored, labels turned at random", "fit_rig", "the rig, to a tenth of a pixel",
+     "calib/test_optics.py::test_a_rig_is_found_whatever_its_mirror_and_labels"),
+    ("pairs shot at different instants, or shifted by one", "measure", "refused, in both parities",
+     "calib/test_optics.py::test_pairs_shot_at_different_instants_are_refused_in_both_parities"),
+    ("no view in common", "fit_rig", "NumericsError", "calib/test_optics.py::test_no_view_in_common_is_said"),
+]  # fmt: skip
