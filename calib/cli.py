@@ -91,7 +91,7 @@ def _say(told: Measured, document: dict[str, Any], out: Path | None) -> None:
     """The result for people, on stderr."""
     rms = document["rms_px"]
     if told.fit is not None:
-        c, sd = told.fit.calibration, told.fit.sd
+        c, sd = told.fit.calibration, told.fit.sure.sd
         mirrored = f", the {c.mirrored} arm mirrored" if c.mirrored else ""
         note(
             f"{document['views_used']} of {document['views_given']} views, model '{c.model}'{mirrored}: residual spike "
