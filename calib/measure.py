@@ -169,7 +169,7 @@ def _fit_json(fit: RigFit) -> dict[str, Any]:
         "common_centre": {"chance": fit.chance, "parallax_px": fit.parallax_px, "parallax_bound_px": fit.bound_px},
         "depth_mm": list(c.depth_mm),
         "crop": {"spike_px_from_rgb_px": crop_homography(c), "depth_mm": depth if np.isfinite(depth) else None,
-                 "sd_px": fit.sure.crop_sd_px, "sd_worst_px": float(np.nanmax(fit.sure.crop_sd_px))},
+                 "sd_px": fit.sure.crop_sd_px, "sd_worst_px": fit.sure.worst_crop_px},
         "sd": dict(fit.sure.sd),
         "sd_leaving_views_out": dict(fit.sure.jackknife),
         "lens": {"spike": len(fit.spike.fit.lenses[0][1]), "rgb": len(fit.rgb.fit.lenses[0][1]), "held": fit.held,

@@ -140,7 +140,7 @@ def judge_fit(fit: RigFit, names: Sequence[str], verdict: Verdict) -> None:
         return
     if not _judge_pairs(fit, names, verdict):
         return  # what else is known of the step between the arms means nothing
-    worst = float(np.nanmax(fit.sure.crop_sd_px)) if np.isfinite(fit.sure.crop_sd_px).any() else np.inf
+    worst = fit.sure.worst_crop_px
     if worst > CROP_PX:
         verdict.warnings.append(
             f"the crop is only known to {worst:.2f} px at the rim of the spike picture: show the board there too"
