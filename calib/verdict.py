@@ -140,12 +140,12 @@ def judge_fit(fit: RigFit, names: Sequence[str], verdict: Verdict) -> None:
         return
     if not _judge_pairs(fit, names, verdict):
         return  # what else is known of the step between the arms means nothing
-    worst = float(np.nanmax(fit.crop_sd_px)) if np.isfinite(fit.crop_sd_px).any() else np.inf
+    worst = fit.sure.worst_crop_px
     if worst > CROP_PX:
         verdict.warnings.append(
             f"the crop is only known to {worst:.2f} px at the rim of the spike picture: show the board there too"
         )
-    left = fit.crop_left_out_px
+    left = fit.sure.crop_left_out_px
     if np.isfinite(left).any() and np.nanmax(left) > 2 * CROP_PX:
         v = int(np.nanargmax(left))
         verdict.warnings.append(
@@ -197,9 +197,9 @@ def focal_sd(fit: RigFit, arm: str) -> float:
     """Relative standard deviation of an arm's focal length: the better of alone and joint, or by leaving views out."""
     mono = fit.spike if arm == "spike" else fit.rgb
     alone = max(mono.fit.sd("fx0"), mono.fit.sd("fy0"))
-    joint = max(fit.sd[f"{arm}.fx_px"], fit.sd[f"{arm}.fy_px"])
-    several = np.isfinite(fit.left_out).all(axis=1).sum() >= ENOUGH
-    scatter = max(fit.jackknife[f"{arm}.fx_px"], fit.jackknife[f"{arm}.fy_px"]) if several else 0.0
+    joint = max(fit.sure.sd[f"{arm}.fx_px"], fit.sure.sd[f"{arm}.fy_px"])
+    several = np.isfinite(fit.sure.left_out).all(axis=1).sum() >= ENOUGH
+    scatter = max(fit.sure.jackknife[f"{arm}.fx_px"], fit.sure.jackknife[f"{arm}.fy_px"]) if several else 0.0
     return float(max(min(alone, joint) if joint > 0 else alone, scatter) / mono.fit.lenses[0][0][0, 0])
 
 

@@ -16,7 +16,7 @@ from spikerig.calib.rig import read_calibration
 from spikerig.calib.shots import Reading, content_hash, pair_up, read_light, still_light
 from spikerig.dataset import cli
 from spikerig.dataset.errors import DataError, UsageError
-from spikerig.dataset.images import srgb8_from_linear, write_image
+from spikerig.dataset.images import read_image, srgb8_from_linear, write_image
 from spikerig.dataset.spikes import SpikeStream, write_spikes
 from spikerig.dataset.stream import SpikeFile
 
@@ -60,8 +60,13 @@ def test_a_good_session_is_written_and_not_overwritten(
     shots: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "calib.json"
-    code, told = run(shots, out, capsys)
+    code, told = run(shots, out, capsys, "--overlays", str(tmp_path / "see"))
     assert code == 0
+    assert len(list((tmp_path / "see").glob("*.png"))) == 10
+    red = read_image(tmp_path / "see/cam_a_02.red-cyan.png").astype(int)
+    seen = red.sum(2) > 90
+    assert seen.mean() > 0.8
+    assert np.abs(red[..., 0] - red[..., 1])[seen].mean() < 8  # edges that agree are gray
     assert told["accepted"] is True
     assert told["paired_by"] == "number"
     assert told["views_used"] == 5

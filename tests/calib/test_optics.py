@@ -30,9 +30,9 @@ def test_a_rig_is_found_whatever_its_mirror_and_labels(mirrored: str | None, shi
     assert fit.other is not None
     assert fit.other.score > 10 * fit.match.score
     assert crop_error_px(found, true) < 0.15
-    assert abs(found.baseline_mm - true.baseline_mm) < 5 * max(fit.sd["baseline_mm"], 1e-9)
-    assert found.spike.K[0, 0] == pytest.approx(620, abs=5 * fit.sd["spike.fx_px"])
-    assert found.rgb.K[0, 2] == pytest.approx(true.rgb.K[0, 2], abs=5 * fit.sd["rgb.cx_px"])
+    assert abs(found.baseline_mm - true.baseline_mm) < 5 * max(fit.sure.sd["baseline_mm"], 1e-9)
+    assert found.spike.K[0, 0] == pytest.approx(620, abs=5 * fit.sure.sd["spike.fx_px"])
+    assert found.rgb.K[0, 2] == pytest.approx(true.rgb.K[0, 2], abs=5 * fit.sure.sd["rgb.cx_px"])
 
 
 def test_the_same_corners_give_the_same_record() -> None:

@@ -88,7 +88,7 @@ def test_mrcals_corners_give_mrcals_rig(shared_data: Callable[[str], Path]) -> N
     step = times(cams[1], inverse(cams[0]))
     assert fit.fit.rms_px() == pytest.approx(0.3 * np.sqrt(2), rel=0.06)  # its noise
     assert not fit.match.mirrored
-    sd = [fit.sd[f"shift_{a}_mm"] for a in "xyz"]
+    sd = [fit.sure.sd[f"shift_{a}_mm"] for a in "xyz"]
     assert np.all(np.abs(fit.fit.step[:, 3] - step[:, 3] * 1000) < 4 * np.array(sd))
     assert max(sd) < 30
     for (K, _), m, arm in zip(fit.fit.lenses, models, ("spike", "rgb"), strict=True):
@@ -96,7 +96,7 @@ def test_mrcals_corners_give_mrcals_rig(shared_data: Callable[[str], Path]) -> N
         want = {"fx": fx, "fy": fy, "cx": cx + 0.5, "cy": cy + 0.5}
         have = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
         for name, value in want.items():
-            assert abs(have[name] - value) < 4 * fit.sd[f"{arm}.{name}_px"], (arm, name)
+            assert abs(have[name] - value) < 4 * fit.sure.sd[f"{arm}.{name}_px"], (arm, name)
 
 
 # opencv/opencv samples/data/left_intrinsics.yml: 13 views of 9x6, 25 mm, 640x480
