@@ -39,7 +39,7 @@ def bounds_of(looked: Looked, effects: Sequence[Effect]) -> dict[str, Bound]:
     first = [e for e in effects if not _codes(e)]
     found = {e.name: e.magnitude(before if e.stage == Stage.LIGHT else after) for e in first}
     for k, e in enumerate(first):
-        if getattr(e, "mixes", False):  # what fills in from neighbours fills in their noise, even in the dark
+        if getattr(e, "on_noise", False):  # it changes the noise that reaches it, even in the dark
             found[e.name] = e.magnitude(_noisy(looked, after, [c for c in first[:k] if c.stage == Stage.RGB]))
     if len(first) < len(effects):
         files = [e for e in effects if _codes(e)]
@@ -84,7 +84,8 @@ def _noisy(looked: Looked, facts: Facts, camera: Sequence[Effect]) -> Facts:
         for hooks in _hooks(looked, camera, k):
             light = light if hooks.linear is None else hooks.linear(light)
         means.append((gray, light.astype(np.float64)))
-    return replace(facts, means=tuple(means))
+    seen = np.concatenate([light.reshape(-1, 3) for _, light in means]) if means else facts.rgb
+    return replace(facts, means=tuple(means), rgb=seen)
 
 
 def _hooks(looked: Looked, effects: Sequence[Effect], number: int = 0) -> list[Hooks]:
