@@ -98,12 +98,14 @@ def _say(told: Measured, document: dict[str, Any], out: Path | None) -> None:
     rms = document["rms_px"]
     if told.fit is not None:
         c, sd = told.fit.calibration, told.fit.sure.sd
+        unsure = "" if told.verdict.accepted else " (not to be trusted)"
         mirrored = f", the {c.mirrored} arm mirrored" if c.mirrored else ""
+        centres = f"baseline {c.baseline_mm:.3f} +- {sd['baseline_mm']:.3f} mm" if c.model == "stereo" else "one centre"
         note(
-            f"{document['views_used']} of {document['views_given']} views, model '{c.model}'{mirrored}: residual spike "
-            f"{rms['spike']:.3f}, rgb {rms['rgb']:.3f}, together {rms['stereo']:.3f} px; focal length spike "
+            f"{document['views_used']} of {document['views_given']} views, model '{c.model}'{mirrored}{unsure}: residual "
+            f"spike {rms['spike']:.3f}, rgb {rms['rgb']:.3f}, together {rms['stereo']:.3f} px; focal length spike "
             f"{c.spike.K[0, 0]:.2f} +- {sd['spike.fx_px']:.2f}, rgb {c.rgb.K[0, 0]:.2f} +- {sd['rgb.fx_px']:.2f} px; "
-            f"baseline {c.baseline_mm:.3f} +- {sd['baseline_mm']:.3f} mm; crop known to {c.sd['crop_px']:.3f} px"
+            f"{centres}; crop known to {c.sd['crop_px']:.3f} px"
         )
     for text in document["warnings"]:
         note(f"note: {text}")
@@ -112,7 +114,7 @@ def _say(told: Measured, document: dict[str, Any], out: Path | None) -> None:
     if out is not None:
         note(f"{out}: written" + ("" if told.verdict.accepted else ", FORCED: the reasons above are recorded in it"))
     else:
-        note("nothing is written; --force keeps it all the same where there is a fit, and records that")
+        note("nothing is written" + ("" if told.fit is None else "; --force keeps it all the same, and records that"))
 
 
 def photometric(

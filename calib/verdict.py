@@ -82,13 +82,14 @@ def _same_place(sight: Sight, u: int, v: int) -> bool | None:
 
 def judge_views(board: Board, seen: Seen, verdict: Verdict) -> NDArray[np.bool_]:
     """Faults of the views themselves; returns which views to fit, bool[V]."""
-    for arm, found in (("spike", _copies(seen, 0)), ("RGB", _copies(seen, 1))):
-        if found:
-            verdict.refuse(
-                "duplicates",
-                f"duplicates: the same {arm} picture serves as {_list(found)}. A picture counted twice makes a result "
-                "look surer than it is, and one paired twice is wrong: remove the copies",
-            )
+    copies = [(arm, found) for arm, found in (("spike", _copies(seen, 0)), ("RGB", _copies(seen, 1))) if found]
+    if copies:
+        which = "; ".join(f"the same {arm} picture serves as {_list(found)}" for arm, found in copies)
+        verdict.refuse(
+            "duplicates",
+            f"duplicates: {which}. A picture counted twice makes a result look surer than it is, and one paired twice "
+            "is wrong: remove the copies",
+        )
     same = repeats(seen)
     still = [name for name, s in zip(seen.names, same, strict=True) if s >= 0]
     if still:
