@@ -104,8 +104,8 @@ def _say(told: Measured, document: dict[str, Any], out: Path | None) -> None:
         note(
             f"{document['views_used']} of {document['views_given']} views, model '{c.model}'{mirrored}{unsure}: "
             f"residual spike {rms['spike']:.3f}, rgb {rms['rgb']:.3f}, together {rms['stereo']:.3f} px; focal length "
-            f"spike {c.spike.K[0, 0]:.2f} +- {sd['spike.fx_px']:.2f}, rgb {c.rgb.K[0, 0]:.2f} +- {sd['rgb.fx_px']:.2f} px; "
-            f"{centres}; crop known to {c.sd['crop_px']:.3f} px"
+            f"spike {c.spike.K[0, 0]:.2f} +- {sd['spike.fx_px']:.2f}, rgb {c.rgb.K[0, 0]:.2f} +- {sd['rgb.fx_px']:.2f} "
+            f"px; {centres}; crop known to {c.sd['crop_px']:.3f} px"
         )
     for text in document["warnings"]:
         note(f"note: {text}")
