@@ -103,9 +103,9 @@ def _say(told: Measured, document: dict[str, Any], out: Path | None) -> None:
         centres = f"baseline {c.baseline_mm:.3f} +- {sd['baseline_mm']:.3f} mm" if c.model == "stereo" else "one centre"
         note(
             f"{document['views_used']} of {document['views_given']} views, model '{c.model}'{mirrored}{unsure}: "
-            f"residual spike {rms['spike']:.3f}, rgb {rms['rgb']:.3f}, together {rms['stereo']:.3f} px; focal "
-            f"length spike {c.spike.K[0, 0]:.2f} +- {sd['spike.fx_px']:.2f}, rgb {c.rgb.K[0, 0]:.2f} +- "
-            f"{sd['rgb.fx_px']:.2f} px; {centres}; crop known to {c.sd['crop_px']:.3f} px"
+            f"residual spike {rms['spike']:.3f}, rgb {rms['rgb']:.3f}, together {rms['stereo']:.3f} px; focal length "
+            f"spike {c.spike.K[0, 0]:.2f} +- {sd['spike.fx_px']:.2f}, rgb {c.rgb.K[0, 0]:.2f} +- {sd['rgb.fx_px']:.2f} "
+            f"px; {centres}; crop known to {c.sd['crop_px']:.3f} px"
         )
     for text in document["warnings"]:
         note(f"note: {text}")

@@ -42,7 +42,7 @@ def main(path: str) -> None:
     if job.get("rig"):
         _rig(job, database)
     lap("features")
-    _match(job, root, database, job["pairs"])
+    _match(job, root, database, _pairs(job) if job["place"] else job["pairs"])
     lap("matches")
     models = _map(job, root, database)
     told["models"] = sorted((m.num_reg_images() for m in models), reverse=True)
@@ -53,6 +53,9 @@ def main(path: str) -> None:
         sparse = root / "sparse"
         sparse.mkdir(exist_ok=True)
         best.write_text(str(sparse))
+        if job["camera"] and job.get("doubt_focal"):
+            told["focal"] = _focal(sparse)
+            lap("focal length")
         if job["place"]:
             told["placed"] = _place(job, root, database, best)
             lap("localising")
@@ -120,6 +123,18 @@ def _match(job: dict[str, Any], root: Path, database: Path, pairs: Any) -> None:
         pycolmap.match_image_pairs(database, pairing_options=pairing, **options)
 
 
+def _pairs(job: dict[str, Any]) -> list[tuple[str, str]]:
+    """Pairs of the images to map alone: COLMAP's own pairing would take every image of the database."""
+    frame = {name: Path(name).name for name in job["map"]}  # arms of one rig have one name, in two folders
+    at = {f: k for k, f in enumerate(sorted(set(frame.values())))}
+    reach = job["overlap"]
+    near = {0, *range(1, reach + 1), *(2**k for k in range(reach))}  # as COLMAP's sequential one
+    names, every = sorted(job["map"]), job["pairs"] == "exhaustive"
+    return [
+        (a, b) for k, a in enumerate(names) for b in names[k + 1 :] if every or abs(at[frame[a]] - at[frame[b]]) in near
+    ]
+
+
 def _map(job: dict[str, Any], root: Path, database: Path) -> list[Any]:
     import pycolmap
 
@@ -177,6 +192,30 @@ def _model(model: Any, root: Path) -> dict[str, Any]:
         "track_length": float(model.compute_mean_track_length()),
         "cameras": cameras,
     }
+
+
+def _focal(sparse: Path) -> dict[str, float]:
+    """The map adjusted once more with a free focal length: its ratio to the one given, and the share of error saved."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction(str(sparse))
+    before = float(model.compute_mean_reprojection_error())
+    given = {}
+    for key, camera in model.cameras.items():
+        given[key] = float(camera.mean_focal_length())
+        if camera.model.name == "PINHOLE":  # one focal length: two of them are free on a circle of views
+            stretch = camera.params[1] / camera.params[0]
+            if abs(stretch - 1) < 0.01:
+                camera.model = pycolmap.CameraModelId.SIMPLE_PINHOLE
+                camera.params = [given[key], *camera.params[2:]]
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = True
+    options.refine_principal_point = options.refine_extra_params = options.print_summary = False
+    pycolmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()
+    after = float(model.compute_mean_reprojection_error())
+    ratios = [float(camera.mean_focal_length()) / given[key] for key, camera in model.cameras.items()]
+    return {"ratio": max(ratios, key=lambda r: abs(r - 1)), "saved": 1 - after / max(before, 1e-12)}
 
 
 def _place(job: dict[str, Any], root: Path, database: Path, model: Any) -> dict[str, Any]:

@@ -83,6 +83,7 @@ class Map:
         seconds: of each step.
         versions: of what made it.
         cameras: as estimated or given.
+        focal: of a known camera, were it free: `ratio` to the one given, and the share of the residual `saved` by it.
     """
 
     poses: Mapping[str, Placed] = field(default_factory=dict)
@@ -95,6 +96,7 @@ class Map:
     seconds: Mapping[str, float] = field(default_factory=dict)
     version: str = ""
     cameras: Mapping[str, Any] = field(default_factory=dict)
+    focal: Mapping[str, float] = field(default_factory=dict)
 
 
 def build_map(
@@ -144,6 +146,7 @@ def build_map(
             "camera": None if camera is None else colmap_camera(camera),
             "separate_cameras": separate_cameras,
             "rig": list(rig) if rig else None,
+            "doubt_focal": rig is None,
             **{k: getattr(options, k) for k in Options.__slots__ if k not in ("pairs", "threads")},
             "threads": options.threads or len(os.sched_getaffinity(0)),
         }
@@ -228,5 +231,12 @@ def _map_of(told: dict[str, Any], root: Path, names: Mapping[str, str]) -> Map:
         for n, r in told.get("placed", {}).items()
     }
     xyz, rgb, error = (np.load(root / f"{key}.npy", allow_pickle=False) for key in ("xyz", "rgb", "error"))
-    more = told["error_px"], tuple(told["models"]), told["seconds"], told["version"], told["cameras"]
+    more = (
+        told["error_px"],
+        tuple(told["models"]),
+        told["seconds"],
+        told["version"],
+        told["cameras"],
+        told.get("focal", {}),
+    )
     return Map(poses, placed, xyz, rgb, error, *more)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.errors import UsageError
+from spikerig.dataset.scene import Frame
 from spikerig.dataset.spikes import SpikeStream
 from spikerig.dataset.texture import Texture, tfi, tfp, tfp_adaptive
 
@@ -64,6 +65,12 @@ def picture_of(texture: Texture) -> NDArray[np.uint8]:
     white = max(float(np.nanpercentile(light, WHITE)), 1e-9)
     light = np.where(texture.known, texture.light, np.nanmedian(light))
     return np.rint(255 * np.clip(light / white, 0, 1) ** (1 / 2.2)).astype(np.uint8)
+
+
+def frame_picture(frame: Frame) -> NDArray[np.uint8]:
+    """A frame's pixels, 8 bits: of 16, the upper ones."""
+    pixels = frame.pixels
+    return (pixels >> 8 if pixels.dtype == np.uint16 else pixels).astype(np.uint8, copy=False)
 
 
 def looks(pictures: list[NDArray[np.uint8]], kind: str) -> Looks:

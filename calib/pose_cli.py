@@ -149,6 +149,7 @@ def report(estimate: Any, options: Any) -> dict[str, Any]:
         "models": list(best.models),
         "error_px": None if best.error_px != best.error_px else best.error_px,
         "points": len(best.xyz),
+        "free_focal": dict(best.focal) or None,
         "kinds": list(estimate.kinds),
         "textures": [{"kind": k.kind, "sharpness": k.sharpness, "noise": k.noise} for k in estimate.looked],
         "agreement": {

@@ -148,7 +148,8 @@ def sweep(scene: Path, views: int, threads: int) -> cost.Sweep:
         before, began = os.times(), time.perf_counter()
         error, told = run()
         wall, after = time.perf_counter() - began, os.times()
-        rows.append(cost.Row(series, value, error, sum(after[:4]) - sum(before[:4]), wall, 0, told))
+        cpu = max(sum(after[:4]) - sum(before[:4]), 1 / os.sysconf("SC_CLK_TCK"))  # in steps of the system's tick
+        rows.append(cost.Row(series, value, error, cpu, wall, 0, told))
         bar.step(extra=f"{series} {value}")
     return cost.Sweep(
         "poses",

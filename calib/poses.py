@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 from spikerig.calib.consensus import Path, agree, apart_by, averaged, paths_through
 from spikerig.calib.gauge import centres, extent
 from spikerig.calib.mapping import Map, Options, build_map
-from spikerig.calib.pictures import KINDS, Looks, looks, picture_of, texture_of
+from spikerig.calib.pictures import KINDS, Looks, frame_picture, looks, picture_of, texture_of
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.scene import Camera, View
 
 Floats = NDArray[np.float64]
 LOOKED_AT = 6  # views on which the kinds of texture are judged
+# A free focal length that is off by the first, and takes the second of the residual with it, says that K is wrong.
+WRONG_FOCAL = ((0.05, 0.02), (0.2, 0.003))
 HARDER = Options(peak_threshold=0.0015, max_ratio=0.85)
 
 
@@ -116,7 +118,7 @@ def estimate_poses(
         raise UsageError("poses need three views with spikes at least", value=f"{len(usable)} of {len(views)} views")
     names = tuple(v.name for v in usable)
     if wanted.arms == "rgb":
-        pictures = {v.name: v.frame.pixels8 for v in usable}
+        pictures = {v.name: frame_picture(v.frame) for v in usable}
         found = build_map(pictures, rgb_camera or camera, options, keep=keep, done=done)
         return _judged(Estimate(names, {n: p.pose for n, p in found.poses.items()}, {}, found, ("rgb",)), wanted)
     ranked = _ranked(usable, wanted)
@@ -168,7 +170,7 @@ class _Rigged:
                         further[f"{folder}{v.name}.at{k:03d}"] = (f"{folder}{v.name}", picture)
         rig = None
         if self.wanted.arms == "both":
-            pictures |= {f"rgb/{v.name}": v.frame.pixels8 for v in self.views}
+            pictures |= {f"rgb/{v.name}": frame_picture(v.frame) for v in self.views}
             rig = rig_config(self.camera, self.rgb_camera, self.spike_from_rgb)
         keep = self.keep if first else None
         step = f"{kind}: "
@@ -311,6 +313,12 @@ def _judged(found: Estimate, wanted: Wanted) -> Estimate:
         reasons.append(f"only {placed} of {asked} views were placed ({wanted.min_share:.0%} asked for); not: {lost}")
     if placed and not found.best.error_px <= wanted.max_error_px:
         reasons.append(f"the mean residual is {found.best.error_px:.2f} px, more than {wanted.max_error_px:g}")
+    focal = found.best.focal
+    if any(abs(focal["ratio"] - 1) > off and focal["saved"] > saved for off, saved in WRONG_FOCAL if focal):
+        reasons.append(
+            f"the map asks for {focal['ratio']:.2f} times the focal length given ({focal['saved']:.0%} less residual): "
+            "wrong intrinsics, or a bent map"
+        )
     if found.agreeing[1] > 1 and found.agreeing[0] < 2:
         reasons.append(f"{found.agreeing[1]} kinds of texture give maps that differ: none is to be trusted")
     if placed >= 3:

@@ -74,6 +74,7 @@ def found(told: dict[str, Any]) -> list[dict[str, Any]]:
             )
         )
     rows.append(_ratios(told))
+    rows.append(_samples(told))
     if told["seconds"]:
         off = [row["predicted"] / row["measured"] for row in told["seconds"]]
         inside = sum(abs(q - 1) <= CLOSE for q in off)
@@ -101,6 +102,21 @@ def ratios(told: dict[str, Any]) -> tuple[list[float], int]:
     (there any bound holds)."""
     rows = [row for scene in told["scenes"] for row in scene["effects"]]
     return [row["bound"] / row["actual"] for row in rows if row["actual"]], sum(not row["actual"] for row in rows)
+
+
+def _samples(told: dict[str, Any]) -> dict[str, Any]:
+    """The errors that light samples leave, against their bounds."""
+    pairs = [
+        (s[key], s[f"{key}_off"]) for s in (scene["samples"] for scene in told["scenes"]) for key in ("spikes", "dn")
+    ]
+    real = sorted(bound / actual for bound, actual in pairs if actual)
+    if not real:
+        return _row(True, "light samples leave no error in these scenes")
+    return _row(
+        sum(q < 1 for q in real) <= BELOW * len(real) and real[len(real) // 2] <= MEDIAN,
+        f"bound over actual error of the light samples: {real[0]:.2f} to {real[-1]:.2f}, median "
+        f"{real[len(real) // 2]:.2f} of {len(real)}",
+    )
 
 
 def _ratios(told: dict[str, Any]) -> dict[str, Any]:

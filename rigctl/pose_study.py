@@ -1,7 +1,7 @@
 """`spikerig cost pose-study`: poses from blurry pictures against poses from spikes, on simulated scenes with truth.
 
-Three ways, same options: one map of the blurry pictures, one map of spike textures, and what `calib poses` does: three
-kinds of texture are mapped, and a result on which they do not agree is refused (and then counts as no success).
+Three ways, with the same options: one map of the blurry pictures, one map of spike textures, and what `calib poses`
+does: three kinds of texture are mapped, and a result on which they do not agree is refused (and is no success).
 """
 
 from __future__ import annotations
@@ -81,6 +81,7 @@ def spec_of(scene: str, blur_px: float, views: int) -> SceneSpec:
 def measure(scene: str, blur_px: float, views: int, seed: int) -> list[Row]:
     """One scene at one blur, every arm: the same options, no second try for the single maps."""
     from spikerig.calib.mapping import Options, build_map
+    from spikerig.calib.pictures import frame_picture
     from spikerig.calib.poses import Wanted, best_kind, estimate_poses, look_at
     from spikerig.dataset.store import open_scene
     from spikerig.rigctl.sim.capture import capture
@@ -93,7 +94,7 @@ def measure(scene: str, blur_px: float, views: int, seed: int) -> list[Row]:
     truth = {v.name: v.pose.cam_from_world for v in seen}
     kind, options = best_kind(seen), Options(seed=seed)
     pictures = {
-        "rgb": {v.name: v.frame.pixels for v in seen},
+        "rgb": {v.name: frame_picture(v.frame) for v in seen},
         "spike": {v.name: look_at(v, 0.5, kind) for v in seen},
     }
     rows = []

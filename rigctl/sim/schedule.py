@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from spikerig.dataset.errors import UsageError
 from spikerig.rigctl.sim.spec import Exposure
 
 
@@ -42,10 +43,15 @@ def track_phases(plan: Schedule) -> NDArray[np.float64]:
 def schedule(exposure: Exposure) -> Schedule:
     """Knots evenly spread over the exposure (rounded to ticks), at the same spacing over the margins.
 
+    Raises:
+        UsageError: sub_poses is 0, as many as a view's motion asks for: `samples.sampled` says how many.
+
     Edges:
         One sub-pose: the picture at the label stands still over exposure and margins.
     """
     ticks, margin, n = exposure.ticks, exposure.margin_ticks, exposure.sub_poses
+    if n < 1:
+        raise UsageError("only a view knows how many light samples its motion asks for", value=f"sub_poses = {n}")
     parts = n if exposure.light == "hold" else max(n - 1, 1)
     inner = np.rint(np.linspace(0, ticks, parts + 1))
     outer = np.rint(np.linspace(0, margin, int(np.ceil(margin * parts / ticks)) + 1))[1:]

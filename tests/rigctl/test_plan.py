@@ -27,6 +27,7 @@ from spikerig.rigctl.sim.judge.looks import look, spread
 from spikerig.rigctl.sim.judge.plan import Plan, judged, plan, resolve, resolved_table
 from spikerig.rigctl.sim.judge.samples import STEP_PX, error_left, motion_px, sampled
 from spikerig.rigctl.sim.judge.tomltext import toml_text
+from spikerig.rigctl.sim.schedule import schedule
 from spikerig.rigctl.sim.sensor import Light
 from spikerig.rigctl.sim.shake import rotation
 from spikerig.rigctl.sim.sources.folder import read_folder
@@ -74,14 +75,14 @@ def test_smallest_first_while_the_sum_fits_in_both_outputs(looked: Any) -> None:
     assert made.left == pytest.approx((1.5, 2.5))
     assert [row.effect.name for row in made.rows] == ["a", "b", "c", "d", "e", "f"]
     reasons = {row.effect.name: row.reason for row in made.rows}
-    assert reasons["a"] == "matters: 3 and 1.5 before exceed 2 spikes"
-    assert reasons["f"] == "matters: 4 and 2.5 before exceed 4 DN"
+    assert reasons["a"] == "matters: 1.5 + 3 > 2 spikes"
+    assert reasons["f"] == "matters: 2.5 + 4 > 4 DN"
     assert reasons["e"] == "changes neither"
     assert "1.5 spikes, 2.5 DN of 2 spikes, 4 DN" in reasons["d"] + reasons["b"] + reasons["c"]
     # one that does not fit in one output does not keep another out of the other one
     assert off(choose(looked, 1.0, 4.0, Fake("x", 1.5, 0), Fake("y", 0, 3.9))) == ["y"]
     # normalised by each output's own tolerance
-    assert off(choose(looked, 10.0, 1.0, Fake("x", 5, 0.1), Fake("y", 0, 0.6), Fake("z", 6, 0))) == ["x", "y"]
+    assert off(choose(looked, 10.0, 1.0, Fake("x", 5, 0.9), Fake("y", 6, 0))) == ["y"]
 
 
 def test_no_tolerance_and_a_huge_one(looked: Any) -> None:
@@ -204,6 +205,8 @@ def test_samples_of_fast_motion(motion: float, light: str, samples: int) -> None
     found = sampled(Exposure(light=light, sub_poses=0), motion)
     assert found.sub_poses == samples
     assert found.ticks == 320
+    with pytest.raises(UsageError):
+        schedule(Exposure(sub_poses=0))  # only a view knows how many
 
 
 def test_motion_of_known_moves() -> None:
@@ -334,7 +337,7 @@ def test_predicted_seconds_have_every_part() -> None:
     assert min(costs.effects.values()) >= 0
     on = sum(costs.effects[e.name] for e in made.effects)
     assert costs.total == pytest.approx(sum(costs.parts.values()) + on)
-    assert {"start", "light", "exposure", "file"} <= set(costs.parts)
+    assert set(costs.parts) == {"start", "light", "exposure", "file", "effects together"}
     more = replace(spec, orbit=replace(spec.orbit, views=100, test=(), test_every=2))
     assert calibrate.predict(work_of(more, made), made).parts["light"] > 5 * costs.parts["light"]
 

@@ -92,7 +92,9 @@ CASES: tuple[Case, ...] = (
     Case("many-views", "8 views around", table=AROUND),
     Case("short", "1 ms: 40 ticks", table=SHORT),
     Case("long", "20 ms: 800 ticks", True, table={"exposure.exposure_ms": 20.0}),
-    Case("paper", "18 samples that hold, no margins", table={"exposure.protocol": "paper"}),
+    Case(
+        "paper", "18 samples that hold, no margins", table={"exposure.protocol": "paper", "exposure.exposure_ms": 0.45}
+    ),
     Case("from-zero", "every pixel starts empty", True, table={"exposure.phase": "zero"}),
     Case("night", "no light at all", table=NIGHT),
 )

@@ -154,8 +154,8 @@ def _pair(values: Sequence[float] | np.ndarray) -> str:
 def _too_much(bound: np.ndarray, left: np.ndarray, room: Sequence[float]) -> str:
     k = int(np.argmax(left + bound - np.array(room)))
     unit = ("spikes", "DN")[k]
-    before = f" and {left[k]:.3g} before" if left[k] else ""
-    return f"matters: {bound[k]:.3g}{before} exceed {room[k]:.3g} {unit}"
+    before = f"{left[k]:.3g} + " if left[k] else ""
+    return f"matters: {before}{bound[k]:.3g} > {room[k]:.3g} {unit}"
 
 
 def room_of(tolerance: Tolerance, facts: Facts, random_phase: bool) -> tuple[float, float]:

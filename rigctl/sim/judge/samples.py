@@ -102,7 +102,7 @@ def error_left(lights: Sequence[Light], parts: Sequence[int], sensor: Sensor, ti
     """
     roots, off, moved = [], [], []
     for light, n in zip(lights, parts, strict=True):
-        root = np.sqrt(_squares(spike_light(light.rgb, sensor)))
+        root = np.sqrt(_squares(np.minimum(spike_light(light.rgb, sensor), 1)))  # a spike a tick is all there is
         roots.append(root.ravel())
         off.append(root.ravel() * (2 * ticks / np.sqrt(12) / n))
         change = np.sqrt(_squares(light.rgb)) * (2 / np.sqrt(12) / n)

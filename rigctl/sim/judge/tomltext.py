@@ -47,7 +47,7 @@ def _value(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=True).replace("\x7f", "\\u007f")
+        return json.dumps(value)
     if isinstance(value, int):
         return str(value)
     if isinstance(value, float):

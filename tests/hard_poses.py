@@ -1,0 +1,52 @@
+"""Hard inputs of camera poses from pictures."""
+
+MODES = "calib/test_pose_modes.py::"
+POSES = "calib/test_poses.py::"
+PICTURES = "calib/test_pictures.py::"
+ROWS = [
+    (
+        "no spike at all: black textures",
+        "estimate_poses",
+        "refused, none placed",
+        MODES + "test_pictures_without_anything",
+    ),
+    ("one picture, six times", "estimate_poses", "refused", MODES + "test_identical_views"),
+    ("a camera that turns at one place", "estimate_poses", "refused", MODES + "test_one_place"),
+    ("two views", "estimate_poses", "UsageError: three are needed", MODES + "test_too_few_views"),
+    (
+        "half, 1.3 times and twice the right focal length",
+        "estimate_poses",
+        "refused, though residuals are small: a free focal length goes back to within 10 % of the right one",
+        MODES + "test_another_cameras_intrinsics",
+    ),
+    (
+        "no kind of texture places enough views",
+        "estimate_poses",
+        "every kind is tried once, then low contrast; refused",
+        MODES + "test_a_second_try_keeps_its_own_name",
+    ),
+    (
+        "features hardly found in any view",
+        "spikerig calib poses",
+        "exit 4, nothing written, what to try",
+        POSES + "test_a_map_that_leaves_most_out_is_refused",
+    ),
+    (
+        "kinds of texture that give different maps, residuals of 9 px, residuals that are NaN",
+        "estimate_poses",
+        "refused, each by its own reason",
+        POSES + "test_reasons",
+    ),
+    (
+        "COLMAP ends its process",
+        "mapping.run_child",
+        "one HostError that names the signal",
+        PICTURES + "test_a_child_that_dies_is_one_clear_error",
+    ),
+    (
+        "a folder without pictures, of equal stems, of unrelated pictures",
+        "spikerig calib poses",
+        "exit 2, 2, 4",
+        "calib/test_pose_folder.py::test_folders_that_are_refused",
+    ),
+]
