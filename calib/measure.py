@@ -14,6 +14,7 @@ from spikerig.calib.bundle import Sight
 from spikerig.calib.crop import crop_homography, working_depth_mm
 from spikerig.calib.lens import LENSES
 from spikerig.calib.optics import MirrorHint, RigFit, fit_rig, sight_of
+from spikerig.calib.parity import inverse
 from spikerig.calib.shots import Pair, Reading, content_hash, read_light
 from spikerig.calib.verdict import Seen, Verdict, coverage, judge_fit, judge_views, pair_rms_px, tilt_deg
 from spikerig.dataset.errors import DataError, NumericsError, RigError
@@ -163,6 +164,7 @@ def _fit_json(fit: RigFit) -> dict[str, Any]:
         "focal_px": {"spike": [c.spike.K[0, 0], c.spike.K[1, 1]], "rgb": [c.rgb.K[0, 0], c.rgb.K[1, 1]]},
         "baseline_mm": c.baseline_mm,
         "turn_deg": turned,
+        "rgb_from_spike": inverse(c.spike_from_rgb.cam_from_world),
         "model": c.model,
         "mirrored": c.mirrored,
         "parity_px": {"mirrored" if m.mirrored else "plain": m.score * diagonal for m in parities},

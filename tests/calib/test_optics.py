@@ -146,6 +146,22 @@ def test_a_mirrored_arm_is_no_fault_unless_the_mirror_is_denied() -> None:
     assert report(measure(BOARD, seen_of(sights), mirror="none", lenses=(4,)))["reason_codes"] == ["not-one-rig"]
 
 
+@pytest.mark.parametrize("mirrored", [(False, False), (True, False), (False, True), (True, True)])
+def test_a_charuco_board_says_which_arm_is_mirrored(mirrored: tuple[bool, bool]) -> None:
+    board = Board(9, 6, 16.0, "DICT_5X5_100", 12.0)
+    raw = [s.flipped() if flip else s for s, flip in zip(corners_seen(rig(), 6), mirrored, strict=True)]
+    part = np.random.default_rng(0).random((6, 54)) < 0.8  # some of it hidden
+    seen = seen_of((raw[0], dataclasses.replace(raw[1], seen=raw[1].seen & part)))
+    told = measure(board, seen, mirrored, lenses=(4,))
+    assert told.verdict.accepted, told.verdict.reasons
+    assert told.fit is not None
+    arm = {(True, False): "spike", (False, True): "rgb"}.get(mirrored)
+    assert told.fit.calibration.mirrored == arm
+    assert told.fit.other is None
+    if mirrored != (True, True):
+        assert crop_error_px(told.fit.calibration, rig(mirrored=arm)) < 0.15
+
+
 def test_odd_pairs_are_named() -> None:
     first, second = corners_seen(rig(), 10)
     px = second.px.copy()
