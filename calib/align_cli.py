@@ -93,13 +93,13 @@ class _Pictures:
         self.rows: list[Row] = []
 
     def take(self, view: View, aligned: Aligned, warp: Warp, agreement: Agreement) -> None:
-        from spikerig.calib.overlay import overlay
+        from spikerig.calib.overlay import KINDS, overlay
         from spikerig.calib.sheet import row_of, sharp_textures
         from spikerig.dataset.images import write_image
 
         if self.folder is not None:
             self.folder.mkdir(parents=True, exist_ok=True)
-            for kind in ("mix", "red-cyan"):
+            for kind in KINDS:
                 write_image(self.folder / f"{view.name}.{kind}.png", overlay(aligned, kind), force=True)
         if self.wanted:
             self.rows.append(row_of(view.name, aligned, agreement, sharp_textures(view, self.record, warp)))

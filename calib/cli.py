@@ -34,6 +34,7 @@ def board(
     at: Annotated[float | None, typer.Option(help="Spike files: the instant, in ticks; default the middle.")] = None,
     window: Annotated[int, typer.Option(help="Spike files: ticks of a short texture.")] = 128,
     windows: Annotated[int, typer.Option(help="Short textures averaged at most, while the picture is still.")] = 8,
+    overlays: Annotated[Path | None, typer.Option(help="A folder for an overlay picture of each view.")] = None,
     height: Height = None,
     width: Width = None,
     row_bits: RowBits = None,
@@ -75,6 +76,11 @@ def board(
         record = replace(told.fit.calibration, forced=tuple(document["reason_codes"]))
         write_calibration(out, record, document, force=force)
         document |= {"out": str(out), "id": record.id}
+    if told.fit is not None and overlays is not None:
+        from spikerig.calib.overlay import shot_overlays
+
+        depths = [row.get("depth_mm") for row in document["views"]]
+        shot_overlays(overlays, pairs, reading, told.fit.calibration, depths)
     if as_json:
         emit("spikerig.calib.board/1", document)
     _say(told, document, out if keep else None)
@@ -91,13 +97,15 @@ def _say(told: Measured, document: dict[str, Any], out: Path | None) -> None:
     """The result for people, on stderr."""
     rms = document["rms_px"]
     if told.fit is not None:
-        c, sd = told.fit.calibration, told.fit.sd
+        c, sd = told.fit.calibration, told.fit.sure.sd
+        unsure = "" if told.verdict.accepted else " (not to be trusted)"
         mirrored = f", the {c.mirrored} arm mirrored" if c.mirrored else ""
+        centres = f"baseline {c.baseline_mm:.3f} +- {sd['baseline_mm']:.3f} mm" if c.model == "stereo" else "one centre"
         note(
-            f"{document['views_used']} of {document['views_given']} views, model '{c.model}'{mirrored}: residual spike "
-            f"{rms['spike']:.3f}, rgb {rms['rgb']:.3f}, together {rms['stereo']:.3f} px; focal length spike "
-            f"{c.spike.K[0, 0]:.2f} +- {sd['spike.fx_px']:.2f}, rgb {c.rgb.K[0, 0]:.2f} +- {sd['rgb.fx_px']:.2f} px; "
-            f"baseline {c.baseline_mm:.3f} +- {sd['baseline_mm']:.3f} mm; crop known to {c.sd['crop_px']:.3f} px"
+            f"{document['views_used']} of {document['views_given']} views, model '{c.model}'{mirrored}{unsure}: "
+            f"residual spike {rms['spike']:.3f}, rgb {rms['rgb']:.3f}, together {rms['stereo']:.3f} px; focal length "
+            f"spike {c.spike.K[0, 0]:.2f} +- {sd['spike.fx_px']:.2f}, rgb {c.rgb.K[0, 0]:.2f} +- {sd['rgb.fx_px']:.2f} "
+            f"px; {centres}; crop known to {c.sd['crop_px']:.3f} px"
         )
     for text in document["warnings"]:
         note(f"note: {text}")
@@ -106,7 +114,7 @@ def _say(told: Measured, document: dict[str, Any], out: Path | None) -> None:
     if out is not None:
         note(f"{out}: written" + ("" if told.verdict.accepted else ", FORCED: the reasons above are recorded in it"))
     else:
-        note("nothing is written; --force keeps it all the same where there is a fit, and records that")
+        note("nothing is written" + ("" if told.fit is None else "; --force keeps it all the same, and records that"))
 
 
 def photometric(

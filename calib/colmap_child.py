@@ -42,7 +42,7 @@ def main(path: str) -> None:
     if job.get("rig"):
         _rig(job, database)
     lap("features")
-    _match(job, root, database, job["pairs"])
+    _match(job, root, database, _pairs(job) if job["place"] else job["pairs"])
     lap("matches")
     models = _map(job, root, database)
     told["models"] = sorted((m.num_reg_images() for m in models), reverse=True)
@@ -121,6 +121,18 @@ def _match(job: dict[str, Any], root: Path, database: Path, pairs: Any) -> None:
         listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
         pairing = pycolmap.ImportedPairingOptions(match_list_path=str(listed))
         pycolmap.match_image_pairs(database, pairing_options=pairing, **options)
+
+
+def _pairs(job: dict[str, Any]) -> list[tuple[str, str]]:
+    """Pairs of the images to map alone: COLMAP's own pairing would take every image of the database."""
+    frame = {name: Path(name).name for name in job["map"]}  # arms of one rig have one name, in two folders
+    at = {f: k for k, f in enumerate(sorted(set(frame.values())))}
+    reach = job["overlap"]
+    near = {0, *range(1, reach + 1), *(2**k for k in range(reach))}  # as COLMAP's sequential one
+    names, every = sorted(job["map"]), job["pairs"] == "exhaustive"
+    return [
+        (a, b) for k, a in enumerate(names) for b in names[k + 1 :] if every or abs(at[frame[a]] - at[frame[b]]) in near
+    ]
 
 
 def _map(job: dict[str, Any], root: Path, database: Path) -> list[Any]:

@@ -14,6 +14,7 @@ from spikerig.calib.bundle import Sight
 from spikerig.calib.crop import crop_homography, working_depth_mm
 from spikerig.calib.lens import LENSES
 from spikerig.calib.optics import MirrorHint, RigFit, fit_rig, sight_of
+from spikerig.calib.parity import inverse
 from spikerig.calib.shots import Pair, Reading, content_hash, read_light
 from spikerig.calib.verdict import Seen, Verdict, coverage, judge_fit, judge_views, pair_rms_px, tilt_deg
 from spikerig.dataset.errors import DataError, NumericsError, RigError
@@ -163,15 +164,16 @@ def _fit_json(fit: RigFit) -> dict[str, Any]:
         "focal_px": {"spike": [c.spike.K[0, 0], c.spike.K[1, 1]], "rgb": [c.rgb.K[0, 0], c.rgb.K[1, 1]]},
         "baseline_mm": c.baseline_mm,
         "turn_deg": turned,
+        "rgb_from_spike": inverse(c.spike_from_rgb.cam_from_world),
         "model": c.model,
         "mirrored": c.mirrored,
         "parity_px": {"mirrored" if m.mirrored else "plain": m.score * diagonal for m in parities},
         "common_centre": {"chance": fit.chance, "parallax_px": fit.parallax_px, "parallax_bound_px": fit.bound_px},
         "depth_mm": list(c.depth_mm),
         "crop": {"spike_px_from_rgb_px": crop_homography(c), "depth_mm": depth if np.isfinite(depth) else None,
-                 "sd_px": fit.crop_sd_px, "sd_worst_px": float(np.nanmax(fit.crop_sd_px))},
-        "sd": dict(fit.sd),
-        "sd_leaving_views_out": dict(fit.jackknife),
+                 "sd_px": fit.sure.crop_sd_px, "sd_worst_px": fit.sure.worst_crop_px},
+        "sd": dict(fit.sure.sd),
+        "sd_leaving_views_out": dict(fit.sure.jackknife),
         "lens": {"spike": len(fit.spike.fit.lenses[0][1]), "rgb": len(fit.rgb.fit.lenses[0][1]), "held": fit.held,
                  "foretold_px": {"spike": fit.spike.foretold_px, "rgb": fit.rgb.foretold_px}},
     }  # fmt: skip
@@ -194,8 +196,8 @@ def _views_json(measured: Measured, fit: RigFit) -> list[dict[str, Any]]:
                 "pair_px": fit.match.off_px[at],
                 "tilt_deg": tilts[at],
                 "depth_mm": fit.fit.poses[at, 2, 3],
-                "without_it": {"crop_moves_px": fit.crop_left_out_px[at],
-                               "fx_px": fit.left_out[at, fit.names.index("spike.fx_px")]},
+                "without_it": {"crop_moves_px": fit.sure.crop_left_out_px[at],
+                               "fx_px": fit.sure.left_out[at, fit.sure.names.index("spike.fx_px")]},
             }  # fmt: skip
         rows.append(row)
     return rows

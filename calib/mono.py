@@ -20,7 +20,7 @@ ENOUGH = 8  # views from which on lenses are compared
 ODD = 5.0  # a view this many times as far off as most, ...
 FINE = 3e-4  # ... and by more than this part of the diagonal (0.14 px of 400x250), was misread
 USUAL = 5  # OpenCV's default number of coefficients
-WORTH = 0.02  # a further lens coefficient must foretell unseen views this much better
+WORTH = 0.02  # a lens with fewer coefficients may foretell unseen views this much worse
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +60,9 @@ def fit_lens(board: Floats, sight: Sight, lenses: Sequence[int] = LENSES) -> Mon
     """Fit a camera to the views in which it saw the board.
 
     How many coefficients the lens gets is decided by what they foretell: the views are fitted without every fifth of
-    them in turn, and the ones left out are then explained by their board pose alone. A further coefficient must lower
-    that residual by `WORTH`, and the lens must stay one to one within the picture. (Criteria that count corners as
-    independent take eight coefficients from four views.)
+    them in turn, and the ones left out are then explained by their board pose alone. The fewest coefficients are taken
+    that do that within `WORTH` of the best, of lenses that stay one to one within the picture. (Criteria that count
+    corners as independent take eight coefficients from four views.)
 
     Args:
         board: float64[N,3], z = 0.
@@ -90,9 +90,7 @@ def fit_lens(board: Floats, sight: Sight, lenses: Sequence[int] = LENSES) -> Mon
     foretold: dict[int, float] = {}
     if use.sum() >= ENOUGH and len(covering) > 1:
         foretold = {n: _foretold(board, sight, fits[n], use) for n in covering}
-        best = covering[0]
-        for n in covering:
-            best = n if foretold[n] < foretold[best] * (1 - WORTH) else best
+        best = min(n for n in covering if foretold[n] <= (1 + WORTH) * min(foretold.values()))
     sigma = float(np.sqrt(fits[best].chi2 / fits[best].dof))
     return Mono(fits[best], replace(sight, sigma_px=max(sigma, 1e-4)), foretold, odd)
 

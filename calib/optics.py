@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.calib.boards import Board, Found
-from spikerig.calib.bundle import Fit, Guess, Sight, solve, turn
-from spikerig.calib.crop import grid, parallax_px, rgb_px_from_spike_px, spike_px_from_rgb_px
+from spikerig.calib.bundle import Fit, Guess, Sight, solve
+from spikerig.calib.certainty import Certainty, certainty, parameters, rounded
+from spikerig.calib.crop import parallax_px
 from spikerig.calib.evidence import f_above, hotelling, jackknife_cov
 from spikerig.calib.lens import LENSES, stored
 from spikerig.calib.mono import Mono, fit_lens
@@ -41,12 +42,7 @@ class RigFit:
         held: whether the lenses were held as each arm alone found them.
         chance: of parallax as large as found, if the arms had one centre.
         parallax_px, bound_px: misalignment of one crop over the depths seen, as fitted and with two sd added.
-        left_out: float64[V,P] of `names`: the parameters without each view; NaN for views not used.
-        names: of `left_out` and `sd`: shared parameters, e.g. "spike.fx_px".
-        sd, jackknife: standard deviation of each by the residuals and by leaving views out.
-        crop_sd_px: standard deviation of the crop over the spike picture, float64[4,5] (down, across): the larger of
-            that by the residuals and that by leaving views out.
-        crop_left_out_px: float64[V], how far the crop moves without that view, at most.
+        sure: the uncertainties.
     """
 
     calibration: RigCalibration
@@ -59,12 +55,7 @@ class RigFit:
     chance: float
     parallax_px: float
     bound_px: float
-    left_out: Floats
-    names: tuple[str, ...]
-    sd: Mapping[str, float]
-    jackknife: Mapping[str, float]
-    crop_sd_px: Floats
-    crop_left_out_px: Floats
+    sure: Certainty
 
 
 def sight_of(found: Sequence[Found | None], board: Board, width: int, height: int) -> Sight:
@@ -128,7 +119,12 @@ def fit_rig(
     if chosen == "common":
         left_out = joint.leave_out(common, held)
     record = _record(fit, joint, chosen, mirrored)
-    return _told(record, joint, match, others, fit, held, chance, parallax, bound, left_out)
+    sure = certainty(record, fit, (match.first.fit, match.second.fit), held, left_out)
+    sd = {**{k: v for k, v in sure.sd.items() if np.isfinite(v)}, "crop_px": min(sure.worst_crop_px, 1e6)}
+    return RigFit(
+        rounded(replace(record, sd=sd)), match.first, match.second, match, others[0] if others else None, fit, held,
+        chance, parallax, bound, sure,
+    )  # fmt: skip
 
 
 def unflipped(board: Board, sight: Sight) -> Sight:
@@ -190,22 +186,6 @@ class _Joint:
         return rows
 
 
-def parameters(fit: Fit, near: Fit) -> tuple[tuple[str, ...], Floats]:
-    """Names and values of all shared parameters; the step's turn in radians, away from that of `near`."""
-    names: list[str] = []
-    values: list[float] = []
-    for arm, (K, c) in zip(("spike", "rgb"), fit.lenses, strict=True):
-        names += [f"{arm}.{n}_px" for n in ("fx", "fy", "cx", "cy")] + [f"{arm}.{n}" for n in _COEFFICIENTS[: len(c)]]
-        values += [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *c]
-    R = fit.step[:, :3] @ near.step[:, :3].T
-    names += ["turn_x_rad", "turn_y_rad", "turn_z_rad", "shift_x_mm", "shift_y_mm", "shift_z_mm"]
-    values += [*(np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2), *fit.step[:, 3]]
-    return tuple(names), np.array(values)
-
-
-_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-
-
 def _chance(stereo: Fit, common: Fit, left_out: Floats, views: int) -> float:
     """The chance of the shift found if there were none: by the scatter over views, or of corners where views are few.
 
@@ -238,99 +218,3 @@ def _record(fit: Fit, joint: _Joint, model: Model, mirrored: Arm | None) -> RigC
     return RigCalibration(
         cameras[0], cameras[1], Pose(inverse(fit.step)), model, mirrored, depth, residual_px=fit.rms_px()
     )
-
-
-def _told(
-    record: RigCalibration, joint: _Joint, match: Match, others: Sequence[Match], fit: Fit, held: bool,
-    chance: float, parallax: float, bound: float, left_out: Floats,
-) -> RigFit:  # fmt: skip
-    """Everything together, uncertainties last."""
-    names, at = parameters(fit, fit)
-    free = _free(fit, match, held, names)
-    sd = {n: float(np.sqrt(max(free[k, k], 0))) for k, n in enumerate(names)}
-    rows = left_out[np.isfinite(left_out).all(1)]
-    scatter = np.sqrt(np.diag(jackknife_cov(rows))) if len(rows) > 1 else np.full(len(names), np.nan)
-    here = grid(record.spike.width, record.spike.height, 5, 4)
-    rgb = rgb_px_from_spike_px(record, here)
-
-    def crop(values: Floats) -> Floats:
-        return spike_px_from_rgb_px(_with(record, fit, names, values), rgb)
-
-    steps = np.clip(1e-3 * np.sqrt(np.maximum(np.diag(free), 0)), 1e-9, 1e-3 * np.maximum(np.abs(at), 1e-2))
-    slopes = np.stack([
-        (crop(at + h * e) - crop(at - h * e)) / (2 * h) for h, e in zip(steps, np.eye(len(at)), strict=True)
-    ], -1)  # fmt: skip
-    spread = np.einsum("...ip,pq,...iq->...", slopes, free, slopes)
-    moved = np.full(len(left_out), np.nan)
-    if len(rows) > 1:
-        crops = np.stack([crop(values) for values in rows]) - here
-        moved[np.isfinite(left_out).all(1)] = np.nanmax(np.linalg.norm(crops, axis=-1), axis=(1, 2), initial=0)
-        off = crops - crops.mean(0)
-        spread = np.fmax(spread, (off**2).sum((0, -1)) * (len(rows) - 1) / len(rows))
-    crop_sd = np.sqrt(spread)
-    shift = fit.step[:, 3]
-    unit = shift / max(float(np.linalg.norm(shift)), 1e-300)
-    worst = float(np.nanmax(crop_sd)) if np.isfinite(crop_sd).any() else float("inf")
-    sd["baseline_mm"] = float(np.sqrt(max(unit @ free[-3:, -3:] @ unit, 0)))
-    record = replace(record, sd={**{k: v for k, v in sd.items() if np.isfinite(v)}, "crop_px": min(worst, 1e6)})
-    jackknife = dict(zip(names, scatter.tolist(), strict=True))
-    return RigFit(
-        _rounded(record), match.first, match.second, match, others[0] if others else None, fit, held, chance, parallax,
-        bound, left_out, names, sd, jackknife, crop_sd, moved,
-    )  # fmt: skip
-
-
-def _rounded(record: RigCalibration) -> RigCalibration:
-    """The record without the last digits, which differ from run to run (sums take the order that memory suggests)."""
-
-    def camera(c: Camera) -> Camera:
-        return replace(c, K=c.K.round(6), distortion=c.distortion.round(9))
-
-    M = record.spike_from_rgb.cam_from_world
-    step = np.concatenate([M[:, :3].round(9), M[:, 3:].round(5)], 1) + 0.0  # no negative zeros
-    return replace(
-        record,
-        spike=camera(record.spike),
-        rgb=camera(record.rgb),
-        spike_from_rgb=Pose(step),
-        depth_mm=(round(record.depth_mm[0], 3), round(record.depth_mm[1], 3)),
-        residual_px=round(record.residual_px, 6),
-        sd={name: float(f"{value:.3g}") for name, value in record.sd.items()},
-    )
-
-
-def _free(fit: Fit, match: Match, held: bool, names: tuple[str, ...]) -> Floats:
-    """Covariance float64[P,P] in the order of `names`; of held lenses that of each arm alone."""
-    cov, place = np.zeros((len(names), len(names))), {n: k for k, n in enumerate(names)}
-
-    def put(part: Fit, own: Mapping[str, str]) -> None:
-        at = [place[own[n]] for n in part.names]
-        cov[np.ix_(at, at)] = part.cov
-
-    lens = {f"{n}{k}": f"{arm}.{n}_px" for k, arm in enumerate(("spike", "rgb")) for n in ("fx", "fy", "cx", "cy")}
-    lens |= {f"{n}_{k}": f"{arm}.{n}" for k, arm in enumerate(("spike", "rgb")) for n in _COEFFICIENTS}
-    step = {f"turn_{a}": f"turn_{a}_rad" for a in "xyz"} | {f"shift_{a}": f"shift_{a}_mm" for a in "xyz"}
-    if held:
-        put(match.first.fit, lens)
-        put(match.second.fit, _second(lens))
-    put(fit, {**lens, **step})
-    return cov
-
-
-def _second(lens: Mapping[str, str]) -> dict[str, str]:
-    """Names of a lens fitted alone (camera 0) -> those of the RGB arm."""
-    return {n[:-1] + "0": v for n, v in lens.items() if v.startswith("rgb.")}
-
-
-def _with(record: RigCalibration, fit: Fit, names: tuple[str, ...], values: Floats) -> RigCalibration:
-    """The record with other parameters: lenses, the step's turn and shift."""
-    made: dict[str, Any] = {}
-    at = 0
-    for arm, (K, c) in zip(("spike", "rgb"), fit.lenses, strict=True):
-        fx, fy, cx, cy = values[at : at + 4]
-        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        camera = record.camera(arm)  # type: ignore[arg-type]
-        made[arm] = replace(camera, K=K, distortion=stored(values[at + 4 : at + 4 + len(c)]))
-        at += 4 + len(c)
-    step = np.concatenate([turn(values[at : at + 3]) @ fit.step[:, :3], values[at + 3 :, None]], 1)
-    return replace(record, spike_from_rgb=Pose(inverse(step)), **made)

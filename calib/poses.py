@@ -317,7 +317,7 @@ def _judged(found: Estimate, wanted: Wanted) -> Estimate:
     if any(abs(focal["ratio"] - 1) > off and focal["saved"] > saved for off, saved in WRONG_FOCAL if focal):
         reasons.append(
             f"the map asks for {focal['ratio']:.2f} times the focal length given ({focal['saved']:.0%} less residual): "
-            "these intrinsics are not this camera's"
+            "wrong intrinsics, or a bent map"
         )
     if found.agreeing[1] > 1 and found.agreeing[0] < 2:
         reasons.append(f"{found.agreeing[1]} kinds of texture give maps that differ: none is to be trusted")

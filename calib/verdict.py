@@ -82,13 +82,14 @@ def _same_place(sight: Sight, u: int, v: int) -> bool | None:
 
 def judge_views(board: Board, seen: Seen, verdict: Verdict) -> NDArray[np.bool_]:
     """Faults of the views themselves; returns which views to fit, bool[V]."""
-    for arm, found in (("spike", _copies(seen, 0)), ("RGB", _copies(seen, 1))):
-        if found:
-            verdict.refuse(
-                "duplicates",
-                f"duplicates: the same {arm} picture serves as {_list(found)}. A picture counted twice makes a result "
-                "look surer than it is, and one paired twice is wrong: remove the copies",
-            )
+    copies = [(arm, found) for arm, found in (("spike", _copies(seen, 0)), ("RGB", _copies(seen, 1))) if found]
+    if copies:
+        which = "; ".join(f"the same {arm} picture serves as {_list(found)}" for arm, found in copies)
+        verdict.refuse(
+            "duplicates",
+            f"duplicates: {which}. A picture counted twice makes a result look surer than it is, and one paired twice "
+            "is wrong: remove the copies",
+        )
     same = repeats(seen)
     still = [name for name, s in zip(seen.names, same, strict=True) if s >= 0]
     if still:
@@ -140,12 +141,12 @@ def judge_fit(fit: RigFit, names: Sequence[str], verdict: Verdict) -> None:
         return
     if not _judge_pairs(fit, names, verdict):
         return  # what else is known of the step between the arms means nothing
-    worst = float(np.nanmax(fit.crop_sd_px)) if np.isfinite(fit.crop_sd_px).any() else np.inf
+    worst = fit.sure.worst_crop_px
     if worst > CROP_PX:
         verdict.warnings.append(
             f"the crop is only known to {worst:.2f} px at the rim of the spike picture: show the board there too"
         )
-    left = fit.crop_left_out_px
+    left = fit.sure.crop_left_out_px
     if np.isfinite(left).any() and np.nanmax(left) > 2 * CROP_PX:
         v = int(np.nanargmax(left))
         verdict.warnings.append(
@@ -197,9 +198,9 @@ def focal_sd(fit: RigFit, arm: str) -> float:
     """Relative standard deviation of an arm's focal length: the better of alone and joint, or by leaving views out."""
     mono = fit.spike if arm == "spike" else fit.rgb
     alone = max(mono.fit.sd("fx0"), mono.fit.sd("fy0"))
-    joint = max(fit.sd[f"{arm}.fx_px"], fit.sd[f"{arm}.fy_px"])
-    several = np.isfinite(fit.left_out).all(axis=1).sum() >= ENOUGH
-    scatter = max(fit.jackknife[f"{arm}.fx_px"], fit.jackknife[f"{arm}.fy_px"]) if several else 0.0
+    joint = max(fit.sure.sd[f"{arm}.fx_px"], fit.sure.sd[f"{arm}.fy_px"])
+    several = np.isfinite(fit.sure.left_out).all(axis=1).sum() >= ENOUGH
+    scatter = max(fit.sure.jackknife[f"{arm}.fx_px"], fit.sure.jackknife[f"{arm}.fy_px"]) if several else 0.0
     return float(max(min(alone, joint) if joint > 0 else alone, scatter) / mono.fit.lenses[0][0][0, 0])
 
 

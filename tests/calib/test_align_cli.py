@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +92,16 @@ def test_in_place_only_when_whole(takes: Path, tmp_path: Path, capsys: pytest.Ca
 
     with monkeypatch.context() as broken:
         broken.setattr(aligned_scene, "_truth", fails)
+        assert cli.run(["calib", "align", str(path), "--with", str(takes / "calib.json")]) == 130
+    real = os.replace
+
+    def stopped(source: str | Path, target: str | Path) -> None:
+        if Path(target) == path:
+            raise KeyboardInterrupt
+        real(source, target)
+
+    with monkeypatch.context() as broken:
+        broken.setattr(aligned_scene.os, "replace", stopped)
         assert cli.run(["calib", "align", str(path), "--with", str(takes / "calib.json")]) == 130
     capsys.readouterr()
     assert path.read_bytes() == before

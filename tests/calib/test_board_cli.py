@@ -13,10 +13,10 @@ from spikerig.calib import measure
 from spikerig.calib.boards import Board, Found, find
 from spikerig.calib.parity import times
 from spikerig.calib.rig import read_calibration
-from spikerig.calib.shots import Reading, content_hash, pair_up, read_light, still_light
+from spikerig.calib.shots import Reading, content_hash, moved_px, pair_up, read_light, still_light
 from spikerig.dataset import cli
 from spikerig.dataset.errors import DataError, UsageError
-from spikerig.dataset.images import srgb8_from_linear, write_image
+from spikerig.dataset.images import read_image, srgb8_from_linear, write_image
 from spikerig.dataset.spikes import SpikeStream, write_spikes
 from spikerig.dataset.stream import SpikeFile
 
@@ -60,8 +60,13 @@ def test_a_good_session_is_written_and_not_overwritten(
     shots: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "calib.json"
-    code, told = run(shots, out, capsys)
+    code, told = run(shots, out, capsys, "--overlays", str(tmp_path / "see"))
     assert code == 0
+    assert len(list((tmp_path / "see").glob("*.png"))) == 10
+    red = read_image(tmp_path / "see/cam_a_02.red-cyan.png").astype(int)
+    seen = red.sum(2) > 90
+    assert seen.mean() > 0.8
+    assert np.abs(red[..., 0] - red[..., 1])[seen].mean() < 8  # edges that agree are gray
     assert told["accepted"] is True
     assert told["paired_by"] == "number"
     assert told["views_used"] == 5
@@ -166,12 +171,12 @@ def test_files_are_paired_by_stem_then_number_then_order(tmp_path: Path) -> None
             pair_up(a, folder)
 
 
-def moving(still: int, ticks: int = 1024) -> SpikeFile:
+def moving(still: int, elsewhere: int = 35, ticks: int = 1024) -> SpikeFile:
     """A bar that stands for `still` ticks about the middle and is elsewhere before and after."""
     bits = np.zeros((ticks, 40, 64), bool)
     rng = np.random.default_rng(0)
     for t in range(ticks):
-        at = 20 if abs(t - ticks // 2) <= still // 2 else 35
+        at = 20 if abs(t - ticks // 2) <= still // 2 else elsewhere
         bits[t, :, at : at + 12] = rng.random((40, 12)) < 0.4
     stream = SpikeStream.from_pixels(bits, 40_000.0)
     return SpikeFile(Path("x"), "npz", ticks, 40, 64, lambda a, b: stream.bits[a:b], lambda: None, 40_000.0)
@@ -183,6 +188,20 @@ def test_short_windows_are_averaged_as_long_as_the_picture_is_still() -> None:
     assert quiet[:, 22:30].std() == pytest.approx(np.sqrt(0.24 / (7 * 128)), rel=0.25)
     assert brief[:, 22:30].std() == pytest.approx(np.sqrt(0.24 / 128), rel=0.25)
     assert brief[:, 36:46].max() == 0
+    nudged = still_light(moving(200, elsewhere=21), reading)
+    assert nudged[:, 22:30].std() == pytest.approx(np.sqrt(0.24 / 128), rel=0.25)
+
+
+def test_how_far_a_picture_has_moved_is_measured_to_a_twelfth() -> None:
+    y, x = np.mgrid[0:60, 0:80]
+
+    def waves(dx: float, dy: float) -> np.ndarray:
+        return (np.sin((x - dx) / 4) * np.cos((y - dy) / 5)).astype(np.float32)
+
+    for dx, dy in ((0.0, 0.0), (0.3, -0.2), (-1.0, 0.5)):
+        assert moved_px(waves(0, 0), waves(dx, dy)) == pytest.approx(np.hypot(dx, dy), rel=0.08, abs=1e-6)
+    assert moved_px(waves(0, 0), np.zeros((60, 80), np.float32)) == float("inf")
+    assert moved_px(np.ones((60, 80), np.float32), waves(0, 0)) == 0
 
 
 def test_spike_files_that_show_nothing(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from calib_rigs import bundle_of, corners_seen, rig
 
-from spikerig.calib.bundle import Guess, solve, turn
+from spikerig.calib.bundle import Guess, _Problem, solve, turn
 from spikerig.calib.evidence import beta_below, f_above, hotelling, jackknife_cov
 
 
@@ -20,6 +20,23 @@ def test_exact_corners_give_the_exact_rig() -> None:
         [true.spike_from_rgb.cam_from_world, [[0, 0, 0, 1]]]
     )
     np.testing.assert_allclose(back, np.eye(4), atol=1e-6)
+
+
+def test_the_gradient_is_that_of_small_steps() -> None:
+    true = rig(shift=(15.0, -2.0, 3.0))
+    points, sights, guess = bundle_of(true, corners_seen(true, 3))
+    step = np.concatenate([turn(np.array([0.4, -0.5, 0.9])) @ guess.step[:, :3], guess.step[:, 3:]], 1)
+    state = Guess(guess.lenses, guess.poses, step)
+    problem = _Problem(points, sights, np.ones(3, bool), True, True, True)
+    _, _, _, shared, poses, _ = problem.normal(state)
+    slope = np.concatenate([shared, poses.ravel()])
+
+    def cost(change: np.ndarray) -> float:
+        moved = problem.moved(state, change[: len(shared)], change[len(shared) :].reshape(poses.shape))
+        return float(sum((off**2).sum() for off in problem.residuals(moved)[0]))
+
+    told = [(cost(1e-6 * e) - cost(-1e-6 * e)) / 2e-6 for e in np.eye(len(slope))]
+    np.testing.assert_allclose(told, -2 * slope, rtol=1e-4, atol=1e-4 * np.abs(slope).max())
 
 
 def test_uncertainties_are_those_of_many_trials() -> None:

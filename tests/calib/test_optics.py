@@ -30,9 +30,9 @@ def test_a_rig_is_found_whatever_its_mirror_and_labels(mirrored: str | None, shi
     assert fit.other is not None
     assert fit.other.score > 10 * fit.match.score
     assert crop_error_px(found, true) < 0.15
-    assert abs(found.baseline_mm - true.baseline_mm) < 5 * max(fit.sd["baseline_mm"], 1e-9)
-    assert found.spike.K[0, 0] == pytest.approx(620, abs=5 * fit.sd["spike.fx_px"])
-    assert found.rgb.K[0, 2] == pytest.approx(true.rgb.K[0, 2], abs=5 * fit.sd["rgb.cx_px"])
+    assert abs(found.baseline_mm - true.baseline_mm) < 5 * max(fit.sure.sd["baseline_mm"], 1e-9)
+    assert found.spike.K[0, 0] == pytest.approx(620, abs=5 * fit.sure.sd["spike.fx_px"])
+    assert found.rgb.K[0, 2] == pytest.approx(true.rgb.K[0, 2], abs=5 * fit.sure.sd["rgb.cx_px"])
 
 
 def test_the_same_corners_give_the_same_record() -> None:
@@ -144,6 +144,22 @@ def test_a_mirrored_arm_is_no_fault_unless_the_mirror_is_denied() -> None:
     sights = corners_seen(rig((0, 0, 0), "rgb"), VIEWS)
     assert codes(sights) == []
     assert report(measure(BOARD, seen_of(sights), mirror="none", lenses=(4,)))["reason_codes"] == ["not-one-rig"]
+
+
+@pytest.mark.parametrize("mirrored", [(False, False), (True, False), (False, True), (True, True)])
+def test_a_charuco_board_says_which_arm_is_mirrored(mirrored: tuple[bool, bool]) -> None:
+    board = Board(9, 6, 16.0, "DICT_5X5_100", 12.0)
+    raw = [s.flipped() if flip else s for s, flip in zip(corners_seen(rig(), 6), mirrored, strict=True)]
+    part = np.random.default_rng(0).random((6, 54)) < 0.8  # some of it hidden
+    seen = seen_of((raw[0], dataclasses.replace(raw[1], seen=raw[1].seen & part)))
+    told = measure(board, seen, mirrored, lenses=(4,))
+    assert told.verdict.accepted, told.verdict.reasons
+    assert told.fit is not None
+    arm = {(True, False): "spike", (False, True): "rgb"}.get(mirrored)
+    assert told.fit.calibration.mirrored == arm
+    assert told.fit.other is None
+    if mirrored != (True, True):
+        assert crop_error_px(told.fit.calibration, rig(mirrored=arm)) < 0.15
 
 
 def test_odd_pairs_are_named() -> None:

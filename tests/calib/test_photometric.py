@@ -183,6 +183,9 @@ def test_response_and_split_ratio() -> None:
     assert bent.curve == pytest.approx(1.1)
     blind = fit_response(rgb, 0.45 * rgb @ np.array([0.0, 1, 0]), [True] * 4)
     assert blind.response == pytest.approx([0, 1, 0], abs=1e-9)
+    cold = fit_response(rgb, 0.45 * rgb @ np.array([-0.05, 0.8, 0.25]), [True] * 4).response
+    assert cold is not None
+    assert min(cold) == 0
     assert fit_response(rgb, 0.45 * rgb @ true, [True, True, True, False]).used[3] is False
     with pytest.raises(DataError, match="no level"):
         fit_response(rgb, np.zeros(4), [True] * 4)

@@ -137,3 +137,19 @@ def test_a_second_try_ends_when_enough_are_placed(few: Seen, monkeypatch: pytest
     wanted = Wanted(kinds=("tfp48", "tfp64", "tfp96", "tfp128"), maps=1, instants=1)
     assert len(estimate_poses(views, camera, wanted, OPTIONS).poses) == 6
     assert rows == []
+
+
+def test_only_the_mapped_pictures_are_paired() -> None:
+    """Further instants are matched later, with a few neighbours; a rig's arms of one frame count as one."""
+    from spikerig.calib.colmap_child import _pairs
+
+    names = [f"{k:03d}.png" for k in range(30)]
+    every = _pairs({"map": names, "place": ["000.at001.png"], "pairs": "exhaustive", "overlap": 10})
+    assert len(every) == 30 * 29 // 2
+    near = _pairs({"map": names, "pairs": "sequential", "overlap": 2})
+    assert {int(b[:3]) - int(a[:3]) for a, b in near} == {1, 2}
+    both = _pairs(
+        {"map": [f"{arm}/{n}" for arm in ("spike", "rgb") for n in names], "pairs": "sequential", "overlap": 1}
+    )
+    assert ("rgb/000.png", "spike/001.png") in both
+    assert ("rgb/000.png", "spike/002.png") not in both

@@ -30,6 +30,7 @@ class WhiteBalance:
     source: ClassVar[str] = "von Kries: a gain a colour in the sensor's own primaries"
     vanishes: ClassVar[str] = "gains = 1"
     cost_ns: ClassVar[float] = 6.0
+    on_noise: ClassVar[bool] = True  # its bound is taken with the noise that reaches it
 
     def begin(self, site: Site) -> Hooks:
         """The same for every view."""

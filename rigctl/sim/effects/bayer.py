@@ -33,6 +33,7 @@ class Bayer:
     source: ClassVar[str] = "Bayer, US 3971065; bilinear interpolation"
     vanishes: ClassVar[str] = "left out; light that is the same all over comes out as it went in"
     cost_ns: ClassVar[float] = 50.0
+    on_noise: ClassVar[bool] = True  # its bound is taken with the noise that reaches it
 
     def begin(self, site: Site) -> Hooks:
         """The same for every view."""

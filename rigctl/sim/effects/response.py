@@ -37,6 +37,7 @@ class ResponseCurve:
     source: ClassVar[str] = "IEC 61966-2-1; GoPro CineForm SDK: CFHD_CURVE_PROTUNE, a log of base 113"
     vanishes: ClassVar[str] = 'curve = "srgb", contrast = 0'
     cost_ns: ClassVar[float] = 11.0
+    on_noise: ClassVar[bool] = True  # its bound is taken with the noise that reaches it
 
     def begin(self, site: Site) -> Hooks:
         """The same for every view."""

@@ -38,8 +38,10 @@ def bounds_of(looked: Looked, effects: Sequence[Effect]) -> dict[str, Bound]:
     before = with_dark(looked.facts, effects)
     after = with_dark(with_lamps(looked, effects), effects)
     first = [e for e in effects if not _codes(e)]
-    found = {e.name: e.magnitude(before if e.stage == Stage.LIGHT else after) for e in first if e.stage != Stage.RGB}
-    found |= _along(looked, after, [e for e in first if e.stage == Stage.RGB])
+    found = {e.name: e.magnitude(before if e.stage == Stage.LIGHT else after) for e in first}
+    for k, e in enumerate(first):
+        if getattr(e, "on_noise", False):  # it changes the noise that reaches it, even in the dark
+            found[e.name] = e.magnitude(_noisy(looked, after, [c for c in first[:k] if c.stage == Stage.RGB]))
     if len(first) < len(effects):
         files = [e for e in effects if _codes(e)]
         seen, picture = _developed(looked, after, [e for e in first if e.stage == Stage.RGB])
@@ -73,6 +75,18 @@ def with_dark(facts: Facts, effects: Sequence[Effect]) -> Facts:
             hooks.light(dark)
     mean = float(dark.mean())
     return replace(facts, light=facts.light + mean, light_max=facts.light_max + mean) if mean > 0 else facts
+
+
+def _noisy(looked: Looked, facts: Facts, camera: Sequence[Effect]) -> Facts:
+    """Facts whose pictures are as these effects leave the linear light on the RGB sensor."""
+    means = []
+    for k, (gray, rgb) in enumerate(facts.means):
+        light = rgb.astype(np.float32)
+        for hooks in _hooks(looked, camera, k):
+            light = light if hooks.linear is None else hooks.linear(light)
+        means.append((gray, light.astype(np.float64)))
+    seen = np.concatenate([light.reshape(-1, 3) for _, light in means]) if means else facts.rgb
+    return replace(facts, means=tuple(means), rgb=seen)
 
 
 def _hooks(looked: Looked, effects: Sequence[Effect], number: int = 0) -> list[Hooks]:
