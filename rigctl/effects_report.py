@@ -134,7 +134,7 @@ def _nothing(row: dict[str, Any]) -> str:
     return (
         f"A scene that needs nothing ('{row['scene']}' at a tolerance of 1e9): {1e3 * row['planned']:.3f} ms a view "
         f"with its resolved list of effects, {1e3 * row['bare']:.3f} ms by the bare closed form (light to thresholds, "
-        f"fire, mean over the exposure, encode, the two records); the least of forty runs each, in turn. Judging took "
+        f"fire, mean over the exposure, encode); the least of nine runs each, in turn. Judging it took "
         f"{row['judging']:.2f} s, and imports the effects it judges; a fresh process that takes a view of the resolved "
         f"scene file imports {len(row['modules'])} of their modules.\n"
     )

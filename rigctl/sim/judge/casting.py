@@ -39,7 +39,7 @@ def work_of(spec: SceneSpec, made: Plan) -> Work:
     pose = path.poses(times.label)[0]
     fresh = Stage(spec.world)  # light maps are made when first seen
     once = least(lambda: fresh.picture(small, pose, lens.samples), 1)
-    picture = least(lambda: stage.picture(small, pose, lens.samples), 6)  # most of the work
+    picture = least(lambda: stage.picture(small, pose, lens.samples))
     depth = scale * least(lambda: stage.depth(small, pose), 2)
     path_s = least(lambda: view_path(spec, first), 2)
     look = max(least(lambda: timed(spec, first, stage), 2), path_s) if made.samples.chosen else 0.0

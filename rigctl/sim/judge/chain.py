@@ -17,7 +17,6 @@ from spikerig.dataset.images import linear_from_srgb
 from spikerig.rigctl.sim.effects import Effect, Hooks, Site, Stage
 from spikerig.rigctl.sim.judge.facts import RARE, Bound, Facts, told
 from spikerig.rigctl.sim.judge.looks import Looked, spread
-from spikerig.rigctl.sim.judge.survey import some_pixels
 from spikerig.rigctl.sim.rgb import encode
 from spikerig.rigctl.sim.schedule import start_ns
 from spikerig.rigctl.sim.simulate import lit
@@ -95,17 +94,6 @@ def _hooks(looked: Looked, effects: Sequence[Effect], number: int = 0) -> list[H
     t0_s = start_ns(exposure, number) * 1e-9
     site = Site(camera.height, camera.width, number, looked.seed, exposure.rate_hz, t0_s, ticks, camera)
     return [effect.begin(site) for effect in effects]
-
-
-def _along(looked: Looked, facts: Facts, camera: Sequence[Effect]) -> dict[str, Bound]:
-    """Bounds of the RGB camera's effects, each on the linear light that those before it leave, noise and all."""
-    found: dict[str, Bound] = {}
-    for effect, hooks in zip(camera, _hooks(looked, camera), strict=True):
-        found[effect.name] = effect.magnitude(facts)
-        if hooks.linear is not None:
-            after = [(gray, np.asarray(hooks.linear(rgb.astype(np.float32)), np.float64)) for gray, rgb in facts.means]
-            facts = replace(facts, means=tuple(after), rgb=np.concatenate([some_pixels(rgb) for _, rgb in after]))
-    return found
 
 
 def _codes(effect: Effect) -> bool:

@@ -92,17 +92,11 @@ def _facts(look: Look, sensor: Sensor) -> tuple[dict[str, Any], tuple[Floats, Fl
         "radius": np.hypot(y + 0.5 - height / 2, x + 0.5 - width / 2) / half,
         "motion": np.broadcast_to(np.asarray(look.motion, np.float64), (height, width)),
     }
-    pixels = {key: some_pixels(np.asarray(a, np.float64)) for key, a in rows.items()}
-    return pixels, (np.asarray(mean, np.float64), np.asarray(rgb, np.float64))
-
-
-def some_pixels(picture: Floats) -> Floats:
-    """Those pixels of a picture [H,W] or [H,W,C] that facts are of, [n] or [n,C]; the same ones of every picture."""
-    height, width = picture.shape[:2]
     step = max(1, height * width // PIXELS)  # a stride that shares no factor with the width looks at every column
     while step > 1 and np.gcd(step, width) > 1:
         step += 1
-    return picture.reshape(height * width, *picture.shape[2:])[::step]
+    pixels = {key: np.asarray(a, np.float64).reshape(height * width, *a.shape[2:])[::step] for key, a in rows.items()}
+    return pixels, (np.asarray(mean, np.float64), np.asarray(rgb, np.float64))
 
 
 def steepest(picture: Floats) -> Floats:
