@@ -37,10 +37,12 @@ def bounds_of(looked: Looked, effects: Sequence[Effect]) -> dict[str, Bound]:
     before = with_dark(looked.facts, effects)
     after = with_dark(with_lamps(looked, effects), effects)
     first = [e for e in effects if not _codes(e)]
-    found = {e.name: e.magnitude(before if e.stage == Stage.LIGHT else after) for e in first}
+    found = {}
     for k, e in enumerate(first):
+        facts = before if e.stage == Stage.LIGHT else after
         if getattr(e, "on_noise", False):  # it changes the noise that reaches it, even in the dark
-            found[e.name] = e.magnitude(_noisy(looked, after, [c for c in first[:k] if c.stage == Stage.RGB]))
+            facts = _noisy(looked, after, [c for c in first[:k] if c.stage == Stage.RGB])
+        found[e.name] = e.magnitude(facts)
     if len(first) < len(effects):
         files = [e for e in effects if _codes(e)]
         seen, picture = _developed(looked, after, [e for e in first if e.stage == Stage.RGB])
