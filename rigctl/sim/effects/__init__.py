@@ -133,9 +133,9 @@ class Effect(Protocol):
 
     `per` says what `cost_ns` counts: nanoseconds a pixel and "tick", "knot" (a light sample), or "frame" (a picture).
 
-    Optional are `excludes`, names of effects that would count the same thing twice; `placed(folder)`, the effect with its
-    file found from the folder of the scene file (or a RigError); and `on_noise = True` for an RGB effect whose bound must
-    be taken with the noise of those before it, because it changes that too.
+    Optional are `excludes`, names of effects that would count the same thing twice; `placed(folder)`, the effect with
+    its file found from the folder of the scene file (or a RigError); and `on_noise = True` for an RGB effect whose
+    bound must be taken with the noise of those before it, because it changes that too.
     """
 
     name: ClassVar[str]
