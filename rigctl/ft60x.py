@@ -106,7 +106,8 @@ def parse_config(data: bytes) -> ChipConfig:
     clock, mode, channels, options = struct.unpack_from("<BBBH", data, 137)
     if clock >= len(CLOCKS_MHZ) or channels >= len(CHANNELS):
         raise DeviceError("the bridge's config block makes no sense", value=f"clock {clock}, channels {channels}")
-    return ChipConfig(vendor, product, *strings, CLOCKS_MHZ[clock], bool(mode), CHANNELS[channels], options)
+    maker, model, serial = strings
+    return ChipConfig(vendor, product, maker, model, serial, CLOCKS_MHZ[clock], bool(mode), CHANNELS[channels], options)
 
 
 def parse_version(data: bytes) -> str:
