@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Callable
 from typing import Any
@@ -15,13 +16,18 @@ from spikerig.rigctl.ft60x import (
     DATA_IN,
     INTERFACES,
     PRODUCTS,
+    VENDOR,
     VERSION_REQUEST,
     Fault,
     fault_of,
     parse_config,
     parse_version,
 )
+from spikerig.rigctl.profiles import DEFAULT, PROFILES
 
+FALLBACKS = tuple(
+    dataclasses.replace(PROFILES[DEFAULT], vendor=VENDOR, product=product) for product in PRODUCTS
+)  # what `rig find` looks for
 RULE_FILE = "/etc/udev/rules.d/70-spikerig.rules"
 
 
@@ -140,6 +146,13 @@ def open_port(device: Any, profile: WireProfile) -> DeviceFacts:
         raise UsageError("the device has no bulk endpoint 0x82", value=address_of(device), cause="not an FT60x bridge")
     model = PRODUCTS.get(profile.product, f"{profile.vendor:04x}:{profile.product:04x}")
     return DeviceFacts("spike", model, serial_of(device), version, address_of(device), more)
+
+
+def give_back(device: Any) -> None:
+    """Let go of a device; also of one that is gone."""
+    import usb.util
+
+    usb.util.dispose_resources(device)
 
 
 def refusal(error: OSError, what: str, vendor: int, product: int) -> RigError:

@@ -279,7 +279,35 @@ class VidarSource:
 
     def _dispose(self) -> None:
         if self._device is not None:
-            import usb.util
-
-            usb.util.dispose_resources(self._device)
+            usbport.give_back(self._device)
         self._device = None
+
+
+def find(
+    host: Host, backend: Any = None, profiles: tuple[WireProfile, ...] = ()
+) -> tuple[list[DeviceFacts], list[str]]:
+    """Ask every USB device that may be a spike camera what it is.
+
+    Args:
+        host: not used, as no time passes.
+        backend: of pyusb; None: libusb on this machine.
+        profiles: whose USB ids are looked for; by default the FT600's and FT601's.
+
+    Returns:
+        The cameras found, and a line for each device that does not open, with the reason.
+
+    Raises:
+        HostError: there is no libusb.
+    """
+    bus = usbport.libusb() if backend is None else backend
+    ids = {(p.vendor, p.product): p for p in (*usbport.FALLBACKS, *profiles)}
+    found: list[DeviceFacts] = []
+    failed: list[str] = []
+    for profile in ids.values():
+        for device in usbport.cameras(bus, profile.vendor, profile.product):
+            try:
+                found.append(usbport.open_port(device, profile))
+            except RigError as error:
+                failed.append(f"{usbport.address_of(device)}: " + str(error).replace("\n", ";"))
+            usbport.give_back(device)
+    return found, failed
