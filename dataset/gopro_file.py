@@ -255,7 +255,7 @@ def _samples(key: str, payloads: list[dict[str, Stream]], track: Track | None) -
     held = [(n, p[key]) for n, p in enumerate(payloads) if key in p]
     if track is None or len({s.values.shape[1] for _, s in held}) != 1:
         raise DataError("the telemetry contradicts itself", cause=f"{key} changes its number of columns")
-    rows, unit_us = [n for n, _ in held], 1e6 / track.timescale
+    rows, unit_us = [n for n, _ in held], np.float64(1e6 / track.timescale)
     found = [s for _, s in held]
     at_ns, stamped = sample_times(key, found, track.dts[rows] * unit_us, track.durations[rows] * unit_us)
     last = found[-1]
@@ -268,7 +268,7 @@ def _follow(parts: list[_Chapter]) -> list[str]:
     for before, part in itertools.pairwise(parts):
         step = round(NS * float(part.video.durations[0]) / part.video.timescale)
         due = int(before.start_ns[-1]) + step
-        if part.source == "CORI" and abs(int(part.start_ns[0]) - due) <= NS:
+        if part.source == "CORI" and -step <= 2 * (int(part.start_ns[0]) - due) <= 2 * NS:
             continue  # the camera's stamps run through the chapters
         shift = due - int(part.start_ns[0])
         part.start_ns = part.start_ns + shift
@@ -289,13 +289,15 @@ def _joined(parts: list[_Chapter]) -> dict[str, Samples]:
 
 
 def _for_frames(parts: list[_Chapter], key: str) -> NDArray[np.float64] | None:
-    """The first column of a stream for each frame: the sample nearest in time, or by number without stamps."""
+    """The first column of a stream for each frame: by number where there is one a frame, else the nearest in time."""
     if any(key not in p.streams or not len(p.streams[key].values) for p in parts):
         return None
     found = []
     for part in parts:
         samples, frames = part.streams[key], len(part.start_ns)
-        if part.source == "CORI" and samples.stamped:
+        if part.source == "CORI" and len(samples.values) == len(part.streams["CORI"].values):
+            rows = np.minimum(np.arange(frames), len(samples.values) - 1)
+        elif part.source == "CORI" and samples.stamped:
             rows = nearest(samples.at_ns, part.start_ns)
         else:
             rows = ((np.arange(frames) + 0.5) * len(samples.values) / frames).astype(np.intp)
