@@ -26,7 +26,7 @@ TARGET_BYTES, TARGET_S = 12_800_000, 0.0512  # a chunk: 1024 ticks of 400x250 at
 MAX_PAYLOAD = 1 << 27  # a header that tells more is not believed
 STAMPS_AT, MAX_STAMPS, SEALED = 256, 190, PAGE - 8
 STAMP = np.dtype([("end", "<u4"), ("before_ns", "<i8"), ("after_ns", "<i8")])
-_HEAD = struct.Struct("<8sHHIQQQQQqqQQQIIQ16s")
+_HEAD = struct.Struct("<8sHHIQQQQQqqQQQIIQ16sQ")
 _SEAL = struct.Struct("<Q")
 _STEP = 1 << 22  # bytes looked through at a time where the next header has to be found
 
@@ -46,6 +46,7 @@ class ChunkHead:
         lost_recorder: bytes that came and that the recorder could not keep, just before this chunk: exact.
         skipped: bytes that came and were not wanted, just before this chunk, as between two viewpoints: exact.
         why: what told of the loss, at most 16 ASCII letters.
+        suspect: bytes at the end of the epoch before among which a loss on the link may lie.
         payload: bytes.
         digest: xxh3_64 of the payload.
     """
@@ -61,6 +62,7 @@ class ChunkHead:
     lost_recorder: int = 0
     skipped: int = 0
     why: str = ""
+    suspect: int = 0
     payload: int = 0
     digest: int = 0
 
@@ -153,7 +155,7 @@ def encode_head(head: ChunkHead, stamps: NDArray[np.void]) -> bytes:
         fields = _HEAD.pack(
             MAGIC, VERSION, len(stamps), head.tick_bytes, head.take, head.number, head.epoch, head.byte_index,
             head.tick, head.first_ns, head.last_ns, head.lost_transport, head.lost_recorder, head.skipped,
-            head.payload, head.stored, head.digest, why,
+            head.payload, head.stored, head.digest, why, head.suspect,
         )  # fmt: skip
     except struct.error as error:
         raise UsageError("a chunk's numbers do not fit its header", value=f"{head}: {error}") from None
@@ -173,14 +175,27 @@ def decode_head(data: bytes) -> tuple[ChunkHead, NDArray[np.void]] | None:
     if _SEAL.unpack_from(data, SEALED)[0] != xxhash.xxh3_64_intdigest(data[:SEALED]):
         return None
     _, version, count, tick_bytes, take, number, epoch, byte_index, tick, first, last, *rest = _HEAD.unpack_from(data)
-    transport, recorder, skipped, payload, stored, digest, why = rest
+    transport, recorder, skipped, payload, stored, digest, why, suspect = rest
     if version > VERSION:
         raise DataError("a chunk of a newer version", value=version, expected=str(VERSION), next="update spikerig")
     text = why.rstrip(b"\0").decode("ascii", "replace")
     if tick_bytes < 1 or not 0 < payload <= MAX_PAYLOAD or count > MAX_STAMPS:
         return None
     head = ChunkHead(
-        take, number, epoch, byte_index, tick_bytes, first, last, transport, recorder, skipped, text, payload, digest
+        take,
+        number,
+        epoch,
+        byte_index,
+        tick_bytes,
+        first,
+        last,
+        transport,
+        recorder,
+        skipped,
+        text,
+        suspect,
+        payload,
+        digest,
     )
     stamps = np.frombuffer(data, STAMP, count, STAMPS_AT)
     ends = stamps["end"].astype(np.int64)

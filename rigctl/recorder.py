@@ -259,9 +259,11 @@ class Recorder:
         self._pending.why = block.lost_why or ("start" if first or not lost else "gap")
         self._pending.skipped = self._pending.lost_recorder = 0
         self._pending.lost_transport += lost
+        self._pending.suspect = block.suspect_bytes
         self._lost_transport += lost
         if lost or block.lost_why:
             self._tell("transport", epoch=block.epoch, byte_index=block.byte_index, lost_bytes=lost,
+                       suspect_bytes=block.suspect_bytes,
                        words=f"lost on the link: {block.lost_why or 'a gap'}")  # fmt: skip
         self._epoch = block.epoch
         if self._keeping:
@@ -293,8 +295,8 @@ class Recorder:
         told = self._pending
         slot.epoch, slot.byte_index = self._epoch, at
         slot.lost_transport, slot.lost_recorder = told.lost_transport, told.lost_recorder
-        slot.skipped, slot.why = told.skipped, told.why
-        told.lost_transport = told.lost_recorder = told.skipped = 0
+        slot.skipped, slot.suspect, slot.why = told.skipped, told.suspect, told.why
+        told.lost_transport = told.lost_recorder = told.skipped = told.suspect = 0
         told.why = ""
         self._slot = slot
         return slot
@@ -364,8 +366,8 @@ class Recorder:
         stamps = thinned(np.array(slot.stamps, STAMP))
         head = ChunkHead(
             self.take, self._number, slot.epoch, slot.byte_index, self.tick_bytes, slot.stamps[0][1],
-            slot.stamps[-1][2], slot.lost_transport, slot.lost_recorder, slot.skipped, slot.why, slot.used,
-            xxhash.xxh3_64_intdigest(slot.room[: slot.used].data),
+            slot.stamps[-1][2], slot.lost_transport, slot.lost_recorder, slot.skipped, slot.why, slot.suspect,
+            slot.used, xxhash.xxh3_64_intdigest(slot.room[: slot.used].data),
         )  # fmt: skip
         slot.page[:PAGE] = encode_head(head, stamps)
         path, offset = self._writer.write(slot.page[: PAGE + stored])

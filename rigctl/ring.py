@@ -30,6 +30,7 @@ class Slot:
     lost_transport: int = 0
     lost_recorder: int = 0
     skipped: int = 0
+    suspect: int = 0
     why: str = ""
 
 
@@ -82,7 +83,7 @@ class Ring:
             if not self._free:
                 return None
             slot = self._free.popleft()
-        slot.used = slot.lost_transport = slot.lost_recorder = slot.skipped = 0
+        slot.used = slot.lost_transport = slot.lost_recorder = slot.skipped = slot.suspect = 0
         slot.why = ""
         slot.stamps.clear()
         return slot

@@ -67,7 +67,7 @@ def test_a_segment_reads_back_with_stamps_and_bytes(tmp_path: Path) -> None:
 
 
 def test_a_head_tells_everything_it_was_given() -> None:
-    head = ChunkHead(2**64 - 1, 3, 4, 5_000_001, 500, -6, 2**62, 7, 8, 9, "overflow", 10, 2**64 - 1)
+    head = ChunkHead(2**64 - 1, 3, 4, 5_000_001, 500, -6, 2**62, 7, 8, 9, "overflow", 11, 10, 2**64 - 1)
     data = encode_head(head, NO_STAMPS)
     decoded = decode_head(data)
     assert len(data) == PAGE
