@@ -4,49 +4,18 @@ import json
 import shutil
 from pathlib import Path
 
-import board_pictures as bp
 import numpy as np
 import pytest
-from calib_rigs import step_of
 
-from spikerig.calib import measure
-from spikerig.calib.boards import Board, Found, find
-from spikerig.calib.parity import times
 from spikerig.calib.rig import read_calibration
-from spikerig.calib.shots import Reading, content_hash, moved_px, pair_up, read_light, still_light
+from spikerig.calib.shots import Reading, moved_px, pair_up, read_light, still_light
 from spikerig.dataset import cli
 from spikerig.dataset.errors import DataError, UsageError
-from spikerig.dataset.images import read_image, srgb8_from_linear, write_image
+from spikerig.dataset.images import read_image
 from spikerig.dataset.spikes import SpikeStream, write_spikes
 from spikerig.dataset.stream import SpikeFile
 
-SMALL = {"rgb_width": 480}
-
-
-@pytest.fixture(scope="module")
-def shots(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("shots")
-    spike, rgb = bp.lens("spike", 2), bp.lens("rgb", 2, **SMALL)
-    from calib_rigs import rig
-
-    for k, pose in enumerate(bp.poses(5, 31)):
-        for name, light in (("a", spike.picture(pose)), ("b", rgb.picture(times(step_of(rig(**SMALL)), pose)))):
-            (folder / name).mkdir(exist_ok=True)
-            write_image(folder / name / f"cam_{name}_{k:02d}.png", srgb8_from_linear(light)[:, :, None])
-    return folder
-
-
-@pytest.fixture(autouse=True)
-def remembered(monkeypatch: pytest.MonkeyPatch, cache: dict = {}) -> None:  # noqa: B006 - one for all tests
-    """Boards already sought in a picture are not sought again."""
-
-    def once(light: np.ndarray, board: Board) -> Found | None:
-        key = content_hash(light), board
-        if key not in cache:
-            cache[key] = find(light, board)
-        return cache[key]
-
-    monkeypatch.setattr(measure, "find", once)
+pytestmark = pytest.mark.usefixtures("remembered")
 
 
 def run(folder: Path, out: Path, capsys: pytest.CaptureFixture[str], *more: str) -> tuple[int, dict]:
