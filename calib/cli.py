@@ -68,6 +68,8 @@ def board(
     _folders(out.parent, sheet and sheet.parent, made=overlays)
     if sheet is not None:
         refuse_existing(sheet, force)
+        if sheet.suffix.lower() not in (".html", ".svg"):
+            raise UsageError("a sheet is written as .html or .svg", value=sheet)
     pairs, how = pair_up(spike_dir, rgb_dir)
     alone = unpaired(pairs, spike_dir, rgb_dir)
     if how != "stem":

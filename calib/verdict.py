@@ -226,7 +226,7 @@ def _judge_pairs(fit: RigFit, names: Sequence[str], verdict: Verdict) -> bool:
     stereo = pair_rms_px(fit)
     apart = 2 * agree <= pairs or fit.fit.rms_px() > max(FAR_ABOVE * mono, APART * diagonal)
     if apart:
-        tried = "as they are and mirrored" if fit.other is not None else "as they are"
+        tried = "as they are and mirrored" if fit.other is not None else "only as markers or --mirror say"
         verdict.refuse(
             "not-one-rig",
             f"stereo residual far above mono: the arms were tried {tried}, and together fit only to {stereo:.2f} px "
