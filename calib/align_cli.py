@@ -48,9 +48,9 @@ def align(
     Spikes stay raw. The result is held edge against edge; where both arms do not agree it is refused (exit 4).
     """
     from spikerig.calib.aligned_scene import WORST_PX, Wish, check_alignment, write_aligned
-    from spikerig.calib.flat import read_flat
     from spikerig.calib.rig import read_calibration
     from spikerig.calib.sheet import page
+    from spikerig.dataset.flat import read_flat
     from spikerig.dataset.outfile import refuse_existing, whole_file
     from spikerig.dataset.store import open_scene
 

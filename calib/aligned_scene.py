@@ -25,10 +25,10 @@ from spikerig.calib.align import (
     warp_of,
 )
 from spikerig.calib.crop import grid
-from spikerig.calib.flat import FlatField, flattened
 from spikerig.calib.rig import RigCalibration, as_json
 from spikerig.calib.rolling import exposure_texture
 from spikerig.dataset.errors import RefusedError, UsageError
+from spikerig.dataset.flat import FlatField, flattened
 from spikerig.dataset.scene import Truth, View
 from spikerig.dataset.store import SceneFile, open_scene
 from spikerig.dataset.texture import Texture

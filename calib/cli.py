@@ -162,9 +162,9 @@ def photometric(
 ) -> None:
     """Calibrate the sensors' light: flat field, dark rate, vignetting, response, the splitter's ratio."""
     from spikerig.calib.even import measure_even
-    from spikerig.calib.flat import write_flat
     from spikerig.calib.rig import read_calibration, write_calibration
     from spikerig.calib.shots import Reading
+    from spikerig.dataset.flat import write_flat
     from spikerig.dataset.outfile import refuse_existing
 
     if out.suffix.lower() != ".npz":
