@@ -22,6 +22,7 @@ from spikerig.dataset.errors import RigError
 from spikerig.dataset.scene import ERROR, WARNING, Finding
 
 Importance = Literal["error", "warning", "note"]
+BEYOND = "numbers that nothing can be made of"  # NaN rows, times beyond 2^63: findings of the structure's
 NO_VIEW = "no view could be judged"
 Status = Literal["passed", "failed", "undecided"]
 PROFILES: dict[str, str] = {
@@ -171,6 +172,8 @@ def _measure(result: Result, measure: Measure, look: ViewLook) -> None:
         result.undecided[look.name] = str(why)
     except RigError as error:  # a view that cannot be read is a finding of the structure's
         result.undecided[look.name] = f"{error.what} {error.cause}".strip()
+    except (ArithmeticError, ValueError) as error:
+        result.undecided[look.name] = f"{BEYOND}: {error}"
     result.seconds += time.perf_counter() - began
 
 
@@ -186,6 +189,9 @@ def _judge(result: Result, scene: SceneLook) -> list[Finding]:
         return []
     except RigError as error:
         result.undecided[""] = f"{error.what} {error.cause}".strip()
+        return []
+    except (ArithmeticError, ValueError) as error:
+        result.undecided[""] = f"{BEYOND}: {error}"
         return []
     result.figures = {f.name: f.value for f in said if isinstance(f, Figure)}
     return [_finding(rule, f) for f in said if isinstance(f, Fault)]

@@ -253,7 +253,8 @@ def bad_pixels(views: Sequence[Rates], stride: int = 1) -> tuple[NDArray[np.bool
     mean = np.sum([v.rate.astype(np.float64) * v.ticks for v in views], axis=0) / ticks
     around = neighbours(mean, stride)
     usual, most = np.median(around, 0), around.max(0)
-    dead = (mean == 0) & (usual * ticks >= 16)
+    further = np.max([np.median(neighbours(mean, n * stride), 0) for n in (3, 6)], axis=0)  # a dead block has dead rims
+    dead = (mean == 0) & (np.maximum(usual, further) * ticks >= 16)
     hot = (mean > 4 * usual + 0.02) & (mean > 1.5 * most)
     return dead, hot | ((mean > 0.98) & (most < 0.5))
 
