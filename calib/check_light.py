@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.calib.agree import edge_agreement
-from spikerig.calib.align import Warp, linear_of, warp_of, warp_texture
+from spikerig.calib.arms import arms_of
 from spikerig.calib.lag import LAGS, Lagged, lag_of, lagged
 from spikerig.calib.rig import calibration_of
-from spikerig.calib.rolling import exposure_texture
-from spikerig.dataset.bayer import bayer_of, demosaic
 from spikerig.dataset.check import POSED, Check, Fault, Figure, SceneLook, Undecided, ViewLook, check, fault
-from spikerig.dataset.clocktime import NS
 from spikerig.dataset.errors import RigError
-from spikerig.dataset.scene import Frame
-from spikerig.dataset.spikes import SpikeStream
-from spikerig.dataset.texture import Texture
 
 Floats = NDArray[np.float64]
 WORST_PX, VIEW_PX = 0.5, 1.0  # edges apart: the median over views, and of one view
@@ -27,60 +20,6 @@ LAG_TICKS, LAG_SHARE = 2.0, 0.05  # beyond its uncertainty: a lag to warn of; sh
 SURE = 3.0  # standard deviations
 UNEVEN = 0.15  # of a view's gain from the median view's
 GAIN_OFF = 0.3  # of the median gain from the scene's own
-
-
-@dataclass(frozen=True, slots=True)
-class Arms:
-    """Both arms of a view on the scene's camera: RGB light float32[H,W,3], where it may be compared, and its spikes."""
-
-    light: NDArray[np.float32]
-    good: NDArray[np.bool_]
-    stream: SpikeStream
-    frame: Frame
-    rows: NDArray[np.float32]
-    window: float
-    reach: int
-    warp: Warp | None
-    scene: SceneLook
-
-    def texture(self, lag: int = 0) -> Texture:
-        """The spikes' mean over each pixel's own exposure, as if that had been `lag` ticks later."""
-        ns = round(lag * NS / (self.stream.rate_hz or 1.0))
-        made = exposure_texture(self.stream, replace(self.frame, start_ns=self.frame.start_ns + ns), self.rows)
-        bayer = bayer_of(self.scene.info)
-        if bayer is not None:
-            colours = demosaic(made, bayer)
-            made = replace(made, light=colours.light.mean(2), known=colours.known.all(2))
-        return made if self.warp is None else warp_texture(self.warp, made)
-
-
-def arms_of(look: ViewLook) -> Arms:
-    """Both arms of a view; Undecided where they cannot be compared."""
-    s, scene, view = look.survey, look.scene, look.view
-    first, last = look.exposure_ticks
-    if (s.width, s.height) != (scene.camera.width, scene.camera.height):
-        raise Undecided("spikes and pictures are of different sizes: not aligned")
-    reach = int(min(first, s.ticks - last))
-    if reach < 0 or view.frame.exposure_ns <= 0:
-        raise Undecided("the exposure lies outside the spikes, or has no length")
-    begin = max(int(np.floor(first)) - reach - 1, 0)
-    stream = look.spikes(begin, int(np.ceil(last)) + reach + 2)
-    frame = replace(view.frame, clock=stream.clock)
-    if stream.clock != view.frame.clock and scene.clock is not None:
-        frame = replace(frame, start_ns=int(scene.clock.device_from_rig(np.int64(frame.start_ns))))
-    light = linear_of(view.frame)
-    good = view.valid & (view.frame.pixels < 0.98 * view.frame.full).all(2)
-    rows = np.where(view.valid, view.sensor_row, np.median(view.sensor_row[view.valid])).astype(np.float32)
-    window = view.frame.exposure_ns * (s.rate_hz or 0.0) / NS
-    return Arms(light, good, stream, frame, rows, window, reach, _warp(scene), scene)
-
-
-def _warp(scene: SceneLook) -> Warp | None:
-    """How textures of raw spikes come onto the scene's camera; None where they lie on it already."""
-    if scene.calibration is None or not isinstance(scene.info.get("align"), dict):
-        return None
-    warp = warp_of(calibration_of(scene.calibration))
-    return None if warp.same else warp
 
 
 def _lagged(look: ViewLook) -> Lagged:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from spikerig.dataset.stream import SpikeStream
 if TYPE_CHECKING:
     from spikerig.dataset.store_read import SceneFile
 
+T = TypeVar("T")
 BLOCK_BYTES = 8 << 20
 
 
@@ -53,7 +55,20 @@ class Survey:
         return self.ticks - int(gone[: self.ticks].sum())
 
 
-class SceneLook:
+class _Kept:
+    """Remembers what was made once."""
+
+    def __init__(self) -> None:
+        self._made: dict[str, Any] = {}
+
+    def once(self, key: str, make: Callable[[], T]) -> T:
+        """What `make` gives, made when first asked for under this key."""
+        if key not in self._made:
+            self._made[key] = make()
+        return self._made[key]
+
+
+class SceneLook(_Kept):
     """A scene's own facts, without its views.
 
     Attributes:
@@ -61,6 +76,7 @@ class SceneLook:
     """
 
     def __init__(self, file: SceneFile) -> None:
+        super().__init__()
         self.file = file
         self.names, self.train, self.test = file.names, file.train, file.test
         self.camera: Camera = file.camera
@@ -84,10 +100,11 @@ class SceneLook:
         return self.file.calibration
 
 
-class ViewLook:
+class ViewLook(_Kept):
     """One view; what was read is kept as long as this is."""
 
     def __init__(self, scene: SceneLook, name: str) -> None:
+        super().__init__()
         self.scene, self.name = scene, name
 
     @cached_property
