@@ -1,4 +1,4 @@
-"""Small drawings as inline SVG: histograms, bars by name, cameras from above and from the side. No scripts, no links."""
+"""Small drawings as inline SVG, without scripts or links: histograms, bars by name, cameras from two sides."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 SIDE, RIM = 420, 26  # px of a camera plot, and free rim
 DOTS = 500  # points drawn
+PATH = 24.0  # px that the usual path over an exposure is drawn long
 STYLE = (
     "svg{background:#fafafa;border:1px solid #ddd}svg text{font:11px sans-serif;fill:#333}"
     ".train{fill:#2a6fb0;stroke:#2a6fb0}.test{fill:#fff;stroke:#d07000}.way{fill:none;stroke:#bbb}"
@@ -112,7 +113,7 @@ def axes_of(poses: Floats) -> tuple[Floats, Floats, Floats]:
         if np.linalg.norm(sideways) > 0.1:
             break
     across = sideways / np.linalg.norm(sideways)
-    return across, np.cross(up, across), up
+    return across, np.asarray(np.cross(up, across), np.float64), up
 
 
 def _plot(spots: Sequence[Spot], points: Floats | None, plane: Floats, label: str) -> str:
@@ -131,6 +132,7 @@ def _plot(spots: Sequence[Spot], points: Floats | None, plane: Floats, label: st
             [SIDE / 2 + q[..., 0], SIDE / 2 - q[..., 1] if label == "from above" else SIDE / 2 + q[..., 1]], -1
         )
 
+    larger = _larger(spots, scale)
     parts = [f'<circle class="dot" cx="{x:.1f}" cy="{y:.1f}" r="1.3"/>' for x, y in px(dots)
              if 0 < x < SIDE and 0 < y < SIDE]  # fmt: skip
     parts.append(_line("way", px(at)))
@@ -141,14 +143,22 @@ def _plot(spots: Sequence[Spot], points: Floats | None, plane: Floats, label: st
         tip = np.array([x, y])
         wedge = " ".join(f"{u:.1f},{v:.1f}" for u, v in (tip, tip + 16 * (look + side), tip + 16 * (look - side)))
         if spot.path is not None:
-            parts.append(_line("sub", px(spot.path @ plane.T)))
-        parts.append(f'<g class="{_split(spot)}"><title>{html.escape(spot.name)}</title>'
-                     f'<polygon points="{wedge}" fill-opacity=".15"/><circle cx="{x:.1f}" cy="{y:.1f}" r="3"/></g>')  # fmt: skip
+            parts.append(_line("sub", px((spot.centre + larger * (spot.path - spot.centre)) @ plane.T)))
+        parts.append(f'<g class="{_split(spot)}"><title>{html.escape(spot.name)}</title>')
+        parts.append(f'<polygon points="{wedge}" fill-opacity=".15"/><circle cx="{x:.1f}" cy="{y:.1f}" r="3"/></g>')
     for k in sorted({0, len(spots) // 2, len(spots) - 1}):
         x, y = px(at[k])
         parts.append(_text(x + 5, y - 5, spots[k].name[:24]))
-    parts.append(_text(8, 16, f"{label}; {size:.3g} across"))
+    shown = f"; paths {larger:.0f} times as large" if larger > 1 else ""
+    parts.append(_text(8, 16, f"{label}; {size:.3g} across{shown}"))
     return _svg(SIDE, SIDE, parts)
+
+
+def _larger(spots: Sequence[Spot], scale: float) -> float:
+    """How much to magnify paths about their cameras so that the usual one is PATH px long; at least 1."""
+    lengths = [float(np.linalg.norm(np.ptp(s.path, axis=0))) for s in spots if s.path is not None]
+    usual = float(np.median(lengths)) * scale if lengths else 0.0
+    return max(1.0, float(np.round(PATH / usual))) if usual > 1e-6 else 1.0
 
 
 def _some(points: Floats) -> Floats:
