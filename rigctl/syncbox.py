@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Protocol, cast
 
 from spikerig.dataset.clocktime import NS
-from spikerig.dataset.errors import DeviceError, HostError
+from spikerig.dataset.errors import DeviceError, HostError, RigError
 from spikerig.dataset.marks import Probe
 from spikerig.rigctl import harp
 from spikerig.rigctl.devices import DeviceFacts
@@ -302,3 +302,36 @@ def serial_opener(path: str) -> Callable[[], SerialPort]:
         return cast("SerialPort", port)
 
     return opened
+
+
+def find(
+    host: Host, ports: Iterable[tuple[str, str]] | None = None, opener_of: Callable[[str], Any] = serial_opener
+) -> tuple[list[DeviceFacts], list[str]]:
+    """Ask every serial port that may hold a clock box.
+
+    Args:
+        host: the clock that stamps.
+        ports: (path, what the system says of it); None: the system's ports with a USB identity of a Harp device, which
+            are an FTDI's or a Raspberry Pi Pico's.
+        opener_of: makes an opener of a path.
+
+    Returns:
+        The boxes found, and a line for each port that is none or does not open, with the reason.
+    """
+    found, told = [], []
+    for path, says in _serial_ports() if ports is None else ports:
+        try:
+            box = HarpBox(opener_of(path), host, address=path, timeout_ns=300_000_000)
+        except RigError as error:
+            told.append(f"{path} ({says}): {error.what}" + (f": {error.cause}" if error.cause else ""))
+        else:
+            found.append(box.facts)
+            box.close()
+    return found, told
+
+
+def _serial_ports() -> list[tuple[str, str]]:
+    from serial.tools.list_ports import comports
+
+    likely = {0x0403, 0x2E8A}  # FTDI; Raspberry Pi
+    return [(port.device, port.description or "?") for port in comports() if port.vid in likely]

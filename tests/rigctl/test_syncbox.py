@@ -15,7 +15,7 @@ from spikerig.rigctl.sim.emulate.latency import Latency
 from spikerig.rigctl.sim.emulate.oscillator import Oscillator
 from spikerig.rigctl.sim.emulate.serialport import device_errors
 from spikerig.rigctl.sim.emulate.virtual import VirtualHost
-from spikerig.rigctl.syncbox import HarpBox, serial_opener
+from spikerig.rigctl.syncbox import HarpBox, find, serial_opener
 
 S = 1_000_000_000
 FIRMWARES = ["atxmega", "pico"]
@@ -376,3 +376,27 @@ def test_the_port_is_a_serial_exception_when_closed():
     port.close()
     with pytest.raises(serial.SerialException):
         port.read(1)
+
+
+def test_find_tells_what_each_port_holds():
+    host, wire = rig()
+    _, dumb = rig(faults=BoxFaults(lose=1.0), host=host)
+    wires = {"/dev/a": wire, "/dev/b": dumb}
+    found, told = find(
+        host, [("/dev/a", "FTDI"), ("/dev/b", "Pico"), ("/dev/c", "?")], lambda path: device_errors(_port(wires, path))
+    )
+    assert [facts.address for facts in found] == ["/dev/a"]
+    assert found[0].kind == "sync"
+    assert len(told) == 2
+    assert "does not answer" in told[0]
+    assert "cannot be opened" in told[1]
+    wire.port()  # find gave it back
+
+
+def _port(wires, path):
+    def opened():
+        if path not in wires:
+            raise serial.SerialException("no such file")
+        return wires[path].port()
+
+    return opened
