@@ -64,8 +64,12 @@ class Follower:
             self.marks = -1
             self.far.clear()
 
-    def shift(self, by_ns: int, sd_ns: float) -> None:
-        """Move y by a known amount, known to `sd_ns`."""
+    def stood(self, by_ns: int, sd_ns: float) -> None:
+        """x stood still while y went on for `by_ns`, known to `sd_ns`: the crystals had that time to wander."""
+        if self.marks <= 0:
+            return
+        step, noise = transition(by_ns / NS, self.wander)
+        self.state, self.cov = step @ self.state, step @ self.cov @ step.T + noise
         self.state[0] += by_ns
         self.cov[0, 0] += sd_ns**2
         self.far.clear()

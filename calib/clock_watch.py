@@ -77,7 +77,7 @@ class Watch:
 
     def jumped(self, by_ns: int) -> None:
         """The host's clock stood still for `by_ns` while the device's went on (a suspend)."""
-        self.follower.shift(by_ns, 1_000_000.0)
+        self.follower.stood(by_ns, 1_000_000.0)
         self.floors.clear()
 
     def at(self, host_ns: int) -> tuple[int, float]:

@@ -72,8 +72,8 @@ class ClockService:
         self._watches: dict[str, Watch] = {"box": Watch("box", stamp_ns)}
         self._lock = threading.Lock()  # over the watches and the log: the loop, feeders and askers share them
         self._box: SyncBox | None = None
-        self._base = self._next_base = 0  # added to the epochs of the box that is open
-        self._reopened = False  # nothing was heard of it yet
+        self._epochs: dict[int, int] = {}  # ours by the driver's, of the box that is open
+        self._next_epoch = 0
         self._begun_ns, self._suspended = host.now_ns(), host.suspended_ns()
         self._host_epoch, self._pause_ns, self._again_ns = 0, NS // 10, 0
         self._synced_ns = self._fitted_ns = self._begun_ns
@@ -187,16 +187,22 @@ class ClockService:
         return found
 
     def _epoch(self, probe: Probe) -> Probe:
-        """The probe with its epoch counted over all boxes opened; one that kept its time while away goes on with it."""
-        if self._reopened:
-            self._reopened = False
+        """The probe with its epoch counted over all boxes opened.
+
+        A driver begins an epoch where it cannot know better: after an unplug, and when the host was suspended. A box
+        that is still where it should be goes on in its old one.
+        """
+        self._suspend()
+        if probe.epoch not in self._epochs:
             watch = self._watches["box"]
+            epoch = self._next_epoch
             if watch.last_ns is not None:
                 told, good = watch.at(probe.received_ns)
-                kept = abs(probe.device_ns - told) <= max(KEPT_NS, 3 * good)
-                self._base = (watch.epoch if kept else self._next_base) - probe.epoch
-        self._next_base = max(self._next_base, self._base + probe.epoch + 1)
-        return replace(probe, epoch=self._base + probe.epoch)
+                if abs(probe.device_ns - told) <= max(KEPT_NS, 3 * good):
+                    epoch = watch.epoch
+            self._epochs[probe.epoch] = epoch
+            self._next_epoch = max(self._next_epoch, epoch + 1)
+        return replace(probe, epoch=self._epochs[probe.epoch])
 
     def _told_epochs(self, probes: list[Probe]) -> None:
         """A `Reset` for every epoch of the box that is new, before its marks."""
@@ -216,7 +222,7 @@ class ClockService:
             self._again_ns = self._host.now_ns() + self._pause_ns
             self._pause_ns = min(2 * self._pause_ns, round(self._pace.patience_s * NS))
             return None
-        self._reopened, self._pause_ns, self._trouble = True, NS // 10, ""
+        self._epochs, self._pause_ns, self._trouble = {}, NS // 10, ""
         return self._box
 
     def _drop(self, why: str) -> None:
