@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -92,7 +93,8 @@ def align(
     if (accepted or force) and not check:
         kept = ("calibration", "edges_px", "refinement", "accepted", "forced", "regions", "panels", "versions")
         provenance = {k: told[k] for k in kept}
-        provenance |= {"depth_mm": depth_mm, "flat": None if flat is None else flat.name}
+        maps = None if flat is None else {"file": flat.name, "sha256": sha256(flat.read_bytes()).hexdigest()}
+        provenance |= {"depth_mm": depth_mm, "flat": maps}
         told |= write_aligned(source, record, checked, jsonable(provenance), out=out, force=force)
     if as_json:
         emit("spikerig.calib.align/1", told)
