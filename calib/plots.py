@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from spikerig.dataset.scene import View
+
 Floats = NDArray[np.float64]
 SIDE, RIM = 420, 26  # px of a camera plot, and free rim
 DOTS = 500  # points drawn
@@ -33,6 +35,13 @@ class Spot:
     def centre(self) -> Floats:
         """Where it stands."""
         return -self.pose[:, :3].T @ self.pose[:, 3]
+
+
+def spot_of(view: View) -> Spot:
+    """A view's camera."""
+    path = view.trajectory
+    centres = None if path is None else np.stack([-m[:, :3].T @ m[:, 3] for m in path.poses])
+    return Spot(view.name, view.pose.cam_from_world, view.split, centres)
 
 
 def histogram(values: Sequence[float], label: str, *, bound: float | None = None, bins: int = 24) -> str:
