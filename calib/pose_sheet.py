@@ -156,7 +156,7 @@ def page(look: SceneLook, rows: list[str], spots: list[Spot], edges: Mapping[str
         histogram(list(residual.values()), "mean reprojection error, px, by view"),
         _binned(record.get("point_residuals")),
         bars(residual, "mean reprojection error, px, view by view"),
-        bars(seen, "observations in the map, view by view"),
+        bars(seen, "observations in the map, view by view", high_is_bad=False),
     ]
     title = html.escape(f"{look.file.name}: views and cameras")
     head = f"<!doctype html><meta charset=utf-8><title>{title}</title><style>{STYLE}</style>"
