@@ -151,7 +151,7 @@ def _capture_row(view: Any, sharp: NDArray, gain: float) -> dict[str, NDArray]:
     from spikerig.dataset.texture import tfi, tfp
 
     stream = view.spikes
-    at = stream.tick_at(view.frame.mid_ns)
+    at = stream.tick_at(view.mid_ns)
     one = np.unpackbits(stream.bits[int(at)], axis=-1, bitorder="little")[:, : stream.width]
     return {
         "blurry frame": view.frame.pixels / view.frame.full,
