@@ -38,6 +38,7 @@ def run_fit(
     eval_every: float | None = None,
     checkpoint_every: float = 60.0,
     ply: bool = False,
+    score_on: Path | None = None,
 ) -> dict[str, Any]:
     """Train on a scene file and leave a run folder.
 
@@ -50,6 +51,7 @@ def run_fit(
         eval_every: seconds of training between held-out scores; None = a tenth of the run, 0 = only at the end.
         checkpoint_every: seconds between checkpoints.
         ply: write splats.ply at the end.
+        score_on: scene whose held-out views make the curve; None: those of the scene itself.
 
     Returns:
         What `train fit --json` prints.
@@ -62,7 +64,7 @@ def run_fit(
         records.prepare_folder(out, force=force, resume=resume)
         task, record = prepare(scene, path, config)
         state = _start(out, scene, task, resume)
-        exams = _exams(scene)
+        exams = _exams(scene) if score_on is None else _exams_of(score_on, scene)
     record["prepare_seconds"] = time.monotonic() - begin
     _tell(task, record)
     records.write_json(out / records.RECORD, {**record, "steps": state.step, "train_seconds": state.seconds})
@@ -126,6 +128,16 @@ def _isa() -> str:
 def _exams(scene: SceneFile) -> list[Exam]:
     exams, _ = novel_views(scene)
     return exams[:: max(1, -(-len(exams) // MOST_EXAMS))]
+
+
+def _exams_of(path: Path, trained: SceneFile) -> list[Exam]:
+    from spikerig.dataset.store import open_scene
+
+    with open_scene(path) as other:
+        sizes = [f"{s.camera.width}x{s.camera.height}" for s in (other, trained)]
+        if sizes[0] != sizes[1]:
+            raise DataError("the scene to score on has another size", value=sizes[0], expected=sizes[1])
+        return _exams(other)
 
 
 def _tell(task: Task, record: dict[str, Any]) -> None:
