@@ -53,19 +53,40 @@ def steps(out: Path, seconds: dict[str, float], seed: int, train_steps: int = 0)
 
 
 def learn(
-    out: Path, scene: str, method: str, length: tuple[float, int], seed: int, exam: str | None = None
+    out: Path,
+    scene: str,
+    method: str,
+    length: tuple[float, int],
+    seed: int,
+    *,
+    file: str = "",
+    exam: str = "",
+    points: str = "",
 ) -> list[Step]:
-    """Train a method on OUT/SCENE.h5 for (seconds, steps) and score it, on the held-out views of `exam` where given."""
+    """Train a method and score it.
+
+    Args:
+        out: folder of the run.
+        scene: what the run belongs to.
+        method: of training.
+        length: (seconds, steps); steps where not 0.
+        seed: of training.
+        file, exam, points: scenes in `out` to train on, to be scored on, to take initial points from; else `scene`.
+    """
+
+    def at(name: str) -> str:
+        return str(out / f"{name}.h5")
+
     run, (seconds, count) = str(out / f"{scene}-{method}"), length
     long = ("--steps", str(count)) if count else ("--seconds", f"{seconds:g}")
-    where = () if exam is None else (str(out / f"{exam}.h5"),)
-    fit = ("train", "fit", str(out / f"{scene}.h5"), "--field", "splat", "--method", method, "--preset", "draft", *long)
-    fit += ("--seed", str(seed), "-o", run, *(("--score-on", *where) if where else ()), "--force", "--json")
-    score = ("train", "score", run, *where, "--pictures", str(Path(run) / "pictures"), "--force", "--json")
+    fit = ("train", "fit", at(file or scene), "--field", "splat", "--method", method, "--preset", "draft", *long)
+    fit += ("--seed", str(seed), "-o", run, *(("--score-on", at(exam)) if exam else ()))
+    fit += (*(("--points-of", at(points)) if points else ()), "--force", "--json")
+    score = ("train", "score", run, *((at(exam),) if exam else ()), "--pictures", str(Path(run) / "pictures"))
     told = f"{count} steps" if count else f"{seconds:g} s"
     return [
         Step(f"{scene}-{method}-fit", fit, f"train '{method}' on '{scene}' for {told}"),
-        Step(f"{scene}-{method}-score", score, f"score '{method}' on sharp held-out views"),
+        Step(f"{scene}-{method}-score", (*score, "--force", "--json"), f"score '{method}' on sharp held-out views"),
     ]
 
 

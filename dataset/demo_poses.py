@@ -8,7 +8,8 @@ from typing import Any
 
 from spikerig.dataset.demo import Step, learn
 
-TRUE, FOUND = "true", "colmap"  # scenes: by the true calibration and poses, and by what was estimated
+# Three scenes: by true calibration and poses; by estimated ones, from the same initial points; from COLMAP's points.
+TRUE, POSED, FOUND = SCENES = ("true", "posed", "colmap")
 METHODS = ("plain", "average", "spikenerf", "spike-ratio")
 GAUGE = (
     "Estimated poses have a world of their own. One similarity, fitted to the mapped training cameras alone, brings it "
@@ -52,12 +53,15 @@ def posed_steps(out: Path, length: tuple[float, int], seed: int, size: tuple[int
     for method in (*METHODS, "oracle"):
         listed += learn(out, TRUE, method, length, seed)
         if method != "oracle":
+            listed += learn(out, POSED, method, length, seed, file=FOUND, exam=TRUE, points=TRUE)
             listed += learn(out, FOUND, method, length, seed, exam=TRUE)
     return listed
 
 
 def price(results: dict[str, dict[str, Any]], done: dict[str, Any]) -> dict[str, Any] | None:
     """What estimated calibration and poses cost; None where the demo had the true ones only.
+
+    `cost_db` is with the same initial points (the simulator's), `cost_with_points_db` with COLMAP's few.
 
     Args:
         results: scene -> {"methods": method -> {"psnr"}}.
@@ -68,22 +72,28 @@ def price(results: dict[str, dict[str, Any]], done: dict[str, Any]) -> dict[str,
     """
     if FOUND not in results:
         return None
-    true, found = results[TRUE]["methods"], results[FOUND]["methods"]
-    rows = {
-        name: {"true_db": true[name]["psnr"], "colmap_db": m["psnr"], "cost_db": true[name]["psnr"] - m["psnr"]}
-        for name, m in found.items()
-    }
-    costs = [row["cost_db"] for row in rows.values()]
+    rows = {name: _row(*(results[s]["methods"][name]["psnr"] for s in SCENES)) for name in results[FOUND]["methods"]}
     poses, crop = done["colmap-poses"]["said"], done["raw-compare"]["said"]
     edges = {name: done[f"{name}-align"]["said"]["edges_px"]["median"] for name in (TRUE, FOUND)}
     return {
         "methods": rows,
-        "cost_db": {"mean": sum(costs) / len(costs), "worst": max(costs)},
+        "cost_db": _over(rows, "cost_db"),
+        "cost_with_points_db": _over(rows, "cost_with_points_db"),
         "poses": {key: poses[key] for key in ("registered", "images", "error_px", "truth", "left_out")},
         "calibration": {key: crop[key] for key in ("crop_px", "lens_px", "focal_ratio", "turn_deg", "same_mirror")},
         "edges_px": edges,
         "gauge": GAUGE,
     }
+
+
+def _row(true: float, posed: float, found: float) -> dict[str, float]:
+    psnr = {"true_db": true, "posed_db": posed, "colmap_db": found}
+    return psnr | {"cost_db": true - posed, "cost_with_points_db": true - found}
+
+
+def _over(rows: dict[str, dict[str, float]], key: str) -> dict[str, float]:
+    costs = [row[key] for row in rows.values()]
+    return {"mean": sum(costs) / len(costs), "worst": max(costs)}
 
 
 def sentence(cost: dict[str, Any]) -> str:
@@ -93,11 +103,12 @@ def sentence(cost: dict[str, Any]) -> str:
     if truth is not None:
         deg, share = truth["deg"]["median"], 100 * truth["share_of_extent"]["median"]
         off = f", off by {deg:.2f} degrees and {share:.2f} % of the extent (medians)"
-    each = ", ".join(f"{name} {row['cost_db']:+.2f}" for name, row in cost["methods"].items())
+    each = ", ".join(f"{name} {row['cost_db']:.2f}" for name, row in cost["methods"].items())
+    cost_db, whole = cost["cost_db"], cost["cost_with_points_db"]
     return (
-        f"estimated calibration and poses cost {cost['cost_db']['mean']:.2f} dB (mean; worst "
-        f"{cost['cost_db']['worst']:.2f}; {each}): {poses['registered']} of {poses['images']} views placed{off}; crop "
-        f"off by {crop['median']:.3f} px (median), {crop['max']:.3f} at most"
+        f"estimated calibration and poses cost {cost_db['mean']:.2f} dB (mean; {each}), with COLMAP's points to start "
+        f"from too {whole['mean']:.2f} dB; {poses['registered']} of {poses['images']} views placed{off}; crop off by "
+        f"{crop['median']:.3f} px (median), {crop['max']:.3f} at most"
     )
 
 
@@ -105,13 +116,19 @@ def section(cost: dict[str, Any], names: dict[str, str]) -> str:
     """The price as a part of the report; everything that came from a file is escaped."""
     esc = html.escape
     rows = "".join(
-        f"<tr><td>{esc(names.get(name, name))}</td><td>{row['true_db']:.2f}</td><td>{row['colmap_db']:.2f}</td>"
-        f"<td>{row['cost_db']:+.2f}</td></tr>"
+        f"<tr><td>{esc(names.get(name, name))}</td>"
+        + "".join(
+            f"<td>{row[key]:.2f}</td>" for key in ("true_db", "posed_db", "cost_db", "colmap_db", "cost_with_points_db")
+        )
+        + "</tr>"
         for name, row in cost["methods"].items()
+    )
+    heads = "".join(
+        f"<th>{h}</th>" for h in ("method", "true, dB", "estimated, dB", "cost, dB", "and its points, dB", "cost, dB")
     )
     return (
         "<h2>What estimated calibration and poses cost</h2>"
         f"<p class='big'><b>{cost['cost_db']['mean']:.2f}</b> dB in the mean, <b>{cost['cost_db']['worst']:.2f}</b> at "
-        "worst</p><table><tr><th>method</th><th>true, dB</th><th>estimated, dB</th><th>cost, dB</th></tr>"
-        f"{rows}</table><p>{esc(sentence(cost))}.</p><p>{esc(cost['gauge'])}</p>"
+        f"worst; with COLMAP's points to start from <b>{cost['cost_with_points_db']['mean']:.2f}</b> in the mean</p>"
+        f"<table><tr>{heads}</tr>{rows}</table><p>{esc(sentence(cost))}.</p><p>{esc(cost['gauge'])}</p>"
     )

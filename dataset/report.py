@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset import machine
-from spikerig.dataset.demo_poses import FOUND, TRUE, price, section, sentence
+from spikerig.dataset.demo_poses import SCENES, TRUE, price, section, sentence
 from spikerig.dataset.errors import DataError, HostError
 
 OURS = ("spike-ratio", "spike-hybrid")
@@ -107,7 +107,7 @@ def summary(result: dict[str, Any]) -> list[str]:
 def named(scene: str, method: str) -> str:
     """A method in words, on a scene."""
     return NAMES.get(method, method).replace(
-        "true sub-poses", "found sub-poses" if scene == FOUND else "true sub-poses"
+        "true sub-poses", "found sub-poses" if scene in SCENES[1:] else "true sub-poses"
     )
 
 
@@ -129,7 +129,7 @@ def _scene(out: Path, scene: str, done: dict[str, Any]) -> dict[str, Any]:
         }
         label = score["pose_label"]
         history[name] = json.loads((out / f"{scene}-{name}" / "history.json").read_text(encoding="utf-8"))
-    plan = (done.get(f"{'raw' if scene in (TRUE, FOUND) else scene}-capture", {}).get("said") or {}).get("plan_line")
+    plan = (done.get(f"{'raw' if scene in SCENES else scene}-capture", {}).get("said") or {}).get("plan_line")
     return {"methods": methods, **gains(methods), "pose_label": label, "plan": plan, "history": history}
 
 
@@ -138,7 +138,7 @@ def _figures(out: Path, scene: str, result: dict[str, Any]) -> dict[str, bytes]:
     from spikerig.dataset.images import read_image
     from spikerig.dataset.store import open_scene
 
-    exam = TRUE if scene == FOUND else scene  # sharp truth lies on the true camera
+    exam = TRUE if scene in SCENES else scene  # sharp truth lies on the true camera
     with open_scene(out / f"{exam}.h5") as file:
         held_out = file.test[len(file.test) // 2]
         view = file.view(file.train[len(file.train) // 2])
