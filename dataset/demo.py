@@ -8,86 +8,14 @@ import shlex
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from spikerig.dataset.demo_steps import Step, steps
 from spikerig.dataset.errors import DataError, NumericsError, RigError, UsageError
 from spikerig.dataset.terminal import emit, note
-
-# The honest rows: blurry single pose, blurry with true sub-poses, the paper's loss, ours, and the sharp upper bound.
-METHODS = {
-    "demo": ("plain", "average", "spikenerf", "spike-ratio", "oracle"),
-    "chroma": ("plain", "average", "spikenerf", "spike-hybrid", "oracle"),
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """One command line of the demo: a key, its words after `spikerig`, and a line for people."""
-
-    key: str
-    words: tuple[str, ...]
-    says: str
-
-
-def steps(out: Path, seconds: dict[str, float], seed: int, train_steps: int = 0) -> list[Step]:
-    """The demo as data: every command line in order.
-
-    Args:
-        out: folder of the run.
-        seconds: scene name -> training seconds of each method; scenes run in this order.
-        seed: of the simulation and of training.
-        train_steps: of each method, instead of seconds; 0 goes by seconds.
-    """
-    listed: list[Step] = []
-    for scene, budget in seconds.items():
-        file = str(out / f"{scene}.h5")
-        capture = ("sim", "capture", scene, "-o", file, "--seed", str(seed), "--force", "--json")
-        listed.append(Step(f"{scene}-capture", capture, f"simulate the '{scene}' capture"))
-        for method in METHODS[scene]:
-            listed += learn(out, scene, method, (budget, train_steps), seed)
-    return listed
-
-
-def learn(
-    out: Path,
-    scene: str,
-    method: str,
-    length: tuple[float, int],
-    seed: int,
-    *,
-    file: str = "",
-    exam: str = "",
-    points: str = "",
-) -> list[Step]:
-    """Train a method and score it.
-
-    Args:
-        out: folder of the run.
-        scene: what the run belongs to.
-        method: of training.
-        length: (seconds, steps); steps where not 0.
-        seed: of training.
-        file, exam, points: scenes in `out` to train on, to be scored on, to take initial points from; else `scene`.
-    """
-
-    def at(name: str) -> str:
-        return str(out / f"{name}.h5")
-
-    run, (seconds, count) = str(out / f"{scene}-{method}"), length
-    long = ("--steps", str(count)) if count else ("--seconds", f"{seconds:g}")
-    fit = ("train", "fit", at(file or scene), "--field", "splat", "--method", method, "--preset", "draft", *long)
-    fit += ("--seed", str(seed), "-o", run, *(("--score-on", at(exam)) if exam else ()))
-    fit += (*(("--points-of", at(points)) if points else ()), "--force", "--json")
-    score = ("train", "score", run, *((at(exam),) if exam else ()), "--pictures", str(Path(run) / "pictures"))
-    told = f"{count} steps" if count else f"{seconds:g} s"
-    return [
-        Step(f"{scene}-{method}-fit", fit, f"train '{method}' on '{scene}' for {told}"),
-        Step(f"{scene}-{method}-score", (*score, "--force", "--json"), f"score '{method}' on sharp held-out views"),
-    ]
 
 
 def demo(
@@ -100,7 +28,6 @@ def demo(
     poses: Annotated[
         str, typer.Option(help="true, or colmap: a rig to calibrate, and poses to estimate; what both cost in dB.")
     ] = "true",
-    size: Annotated[str, typer.Option(help="With --poses colmap: views of the capture and of the board.")] = "30,14",
     seed: Annotated[int, typer.Option(help="Seed of the simulation and of training.")] = 0,
     force: Annotated[bool, typer.Option("--force", help="Start over; without it an interrupted demo goes on.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
@@ -121,7 +48,7 @@ def demo(
     if poses not in ("true", "colmap"):
         raise UsageError("no such --poses", value=poses, expected="true or colmap")
     if poses == "colmap":
-        plan = posed_steps(out, (seconds, steps_each or 0), seed, _two(size))
+        plan = posed_steps(out, (seconds, steps_each or 0), seed)
     else:
         budgets = {"demo": seconds} | ({"chroma": chroma_seconds} if chroma_seconds else {})
         plan = steps(out, budgets, seed, steps_each or 0)
@@ -142,13 +69,6 @@ def demo(
     for line in report.summary(result):
         note(line)
     note(f"report: {out / 'report.html'}")
-
-
-def _two(text: str) -> tuple[int, int]:
-    views, _, boards = text.partition(",")
-    if not (views.isdecimal() and boards.isdecimal()):
-        raise UsageError("--size is two numbers", value=text, expected="views of the capture, of the board: 30,14")
-    return int(views), int(boards)
 
 
 def run_step(step: Step) -> dict[str, Any]:

@@ -6,11 +6,11 @@ import html
 from pathlib import Path
 from typing import Any
 
-from spikerig.dataset.demo import Step, learn
+from spikerig.dataset.demo_steps import Step, learn
 
 # Three scenes: by true calibration and poses; by estimated ones, from the same initial points; from COLMAP's points.
 TRUE, POSED, FOUND = SCENES = ("true", "posed", "colmap")
-METHODS = ("plain", "average", "spikenerf", "spike-ratio")
+METHODS = ("plain", "average", "spikenerf", "spike-ratio", "oracle")
 GAUGE = (
     "Estimated poses have a world of their own. One similarity, fitted to the mapped training cameras alone, brings it "
     "into that of the true poses; the held-out cameras took no part in it and keep their true poses there. Both are "
@@ -18,14 +18,24 @@ GAUGE = (
 )
 
 
-def posed_steps(out: Path, length: tuple[float, int], seed: int, size: tuple[int, int]) -> list[Step]:
+def posed_steps(
+    out: Path,
+    length: tuple[float, int],
+    seed: int,
+    *,
+    scene: str = "demo",
+    boards: int = 14,
+    methods: tuple[str, ...] = METHODS,
+) -> list[Step]:
     """Every command line of the demo with estimated calibration and poses.
 
     Args:
         out: folder of the run.
         length: (seconds, steps) of each training; steps where not 0.
         seed: of the simulation and of training.
-        size: views of the capture, and of the board.
+        scene: a built-in scene, or a scene file.
+        boards: how many times the board is held up.
+        methods: of training; the oracle, which needs the truth, on the true scene alone.
     """
 
     def at(name: str) -> str:
@@ -34,9 +44,9 @@ def posed_steps(out: Path, length: tuple[float, int], seed: int, size: tuple[int
     rig = ("--rig", "splitter", "--seed", str(seed), "--force", "--json")
     made = ("--force", "--json")
     listed = [
-        Step("raw-capture", ("sim", "capture", "demo", "-o", at("raw.h5"), "--views", str(size[0]), *rig),
+        Step("raw-capture", ("sim", "capture", scene, "-o", at("raw.h5"), *rig),
              "simulate a capture by a rig whose arms differ"),
-        Step("raw-boards", ("sim", "boards", "demo", "-o", at("boards"), "--views", str(size[1]), *rig),
+        Step("raw-boards", ("sim", "boards", scene, "-o", at("boards"), "--views", str(boards), *rig),
              "hold a checkerboard before the same rig"),
         Step("raw-board", ("calib", "board", at("boards/spike"), at("boards/rgb"), "--square-mm", "24",
                            "-o", at("calib.json"), *made), "calibrate the rig from its boards"),
@@ -50,7 +60,7 @@ def posed_steps(out: Path, length: tuple[float, int], seed: int, size: tuple[int
         Step("colmap-poses", ("calib", "poses", at(f"{FOUND}.h5"), "--write", "--json"),
              "estimate the poses from spikes"),
     ]  # fmt: skip
-    for method in (*METHODS, "oracle"):
+    for method in methods:
         listed += learn(out, TRUE, method, length, seed)
         if method != "oracle":
             listed += learn(out, POSED, method, length, seed, file=FOUND, exam=TRUE, points=TRUE)
@@ -116,7 +126,7 @@ def section(cost: dict[str, Any], names: dict[str, str]) -> str:
     """The price as a part of the report; everything that came from a file is escaped."""
     esc = html.escape
     rows = "".join(
-        f"<tr><td>{esc(names.get(name, name))}</td>"
+        f"<tr><td>{esc(str(names.get(name, name)))}</td>"
         + "".join(
             f"<td>{row[key]:.2f}</td>" for key in ("true_db", "posed_db", "cost_db", "colmap_db", "cost_with_points_db")
         )
