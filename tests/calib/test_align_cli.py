@@ -160,8 +160,8 @@ def test_textures_are_evened_out_on_request(takes: Path, tmp_path: Path, capsys:
     code, told = run(capsys, *words, "-o", tmp_path / "out.h5", "--flat", tmp_path / "even.npz")
     assert code == 0
     with open_scene(tmp_path / "out.h5") as scene:
-        assert scene.info["align"]["flat"]["file"] == "even.npz"
-        assert len(scene.info["align"]["flat"]["sha256"]) == 64
+        assert scene.info["align"]["files"]["flat"]["name"] == "even.npz"
+        assert len(scene.info["align"]["files"]["flat"]["sha256"]) == 64
     small = FlatField(*(a[:50] for a in (ones, ones, ones > 0, ones)))
     write_flat(tmp_path / "small.npz", small)
     code, told = run(capsys, *words, "--check", "--flat", tmp_path / "small.npz")
