@@ -283,7 +283,7 @@ class GoProCamera:
             lead_us=round(self.rng.uniform(20_000, 120_000)), skipped=self.faults.skipped,
             header=menu.header(self.settings) | {
                 "MINF": self.nature.model, "FMWR": self.nature.firmware, "CASN": self.nature.serial,
-            }, seed=self.seed + self.clips,
+            }, seed=self.seed + self.clips, hevc=self.settings[menu.CODEC] == 1,
         )  # fmt: skip
         self._unrendered.append((self.clips, take))
         self.truth.append({
