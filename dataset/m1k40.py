@@ -114,17 +114,21 @@ def write_m1k40(path: Path, stream: SpikeStream) -> None:
     """
     if (stream.height, stream.width) != (SIDE, SIDE):
         raise UsageError("an M1K40 stream is 1000x1000", value=f"{stream.height}x{stream.width}")
+    with path.open("wb") as file:
+        for t in range(0, stream.ticks, _STEP):
+            file.write(pack_blocks(stream.bits[t : t + _STEP]).tobytes())
+
+
+def pack_blocks(ticks: Bits) -> Bits:
+    """Packed ticks [T,1000,125] as tagged blocks, uint8[T,1000,2,64]; see `write_m1k40` for the tags."""
     line = np.concatenate([np.arange(HALF, 0, -1), np.arange(1, HALF + 1)])
     channel = np.repeat([0, 2], HALF)
     tags = ((channel[:, None] + [0, 1]) * 1024 + line[:, None]).astype(np.uint16)
-    with path.open("wb") as file:
-        for t in range(0, stream.ticks, _STEP):
-            ticks = stream.bits[t : t + _STEP]
-            rows = np.zeros((len(ticks), SIDE, 2, BLOCK), np.uint8)
-            rows[:, :, 0, :62] = ticks[:, :, :62]
-            rows[:, :, 0, 62] = ticks[:, :, 62] & 15
-            rows[:, :, 1, :62] = (ticks[:, :, 62:124] >> 4) | (ticks[:, :, 63:125] << 4)
-            rows[:, :, 1, 62] = ticks[:, :, 124] >> 4
-            rows[..., 62] |= ((tags & 15) << 4).astype(np.uint8)
-            rows[..., 63] = (tags >> 4).astype(np.uint8)
-            file.write(rows.tobytes())
+    rows = np.zeros((len(ticks), SIDE, 2, BLOCK), np.uint8)
+    rows[:, :, 0, :62] = ticks[:, :, :62]
+    rows[:, :, 0, 62] = ticks[:, :, 62] & 15
+    rows[:, :, 1, :62] = (ticks[:, :, 62:124] >> 4) | (ticks[:, :, 63:125] << 4)
+    rows[:, :, 1, 62] = ticks[:, :, 124] >> 4
+    rows[..., 62] |= ((tags & 15) << 4).astype(np.uint8)
+    rows[..., 63] = (tags >> 4).astype(np.uint8)
+    return rows

@@ -38,6 +38,8 @@ class Block:
         before_ns, after_ns: host time before the transfer was asked for, and after it came back.
         lost_bytes: known or estimated loss on the transport just before this block; 0 within an epoch.
         lost_why: what told of the loss ("overflow", "unplugged", "rate", ...); empty without one.
+        suspect_bytes: how many bytes at the end of the epoch just ended may lie behind the loss: it happened somewhere
+            among them. They are whole and in order but for that one gap.
     """
 
     data: NDArray[np.uint8]
@@ -47,6 +49,7 @@ class Block:
     after_ns: int
     lost_bytes: int = 0
     lost_why: str = ""
+    suspect_bytes: int = 0
 
 
 class SpikeSource(Protocol):

@@ -1,0 +1,142 @@
+"""Bytes against time: the rate of a stream that carries no clock, and losses that nobody reports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from spikerig.dataset.clocktime import NS
+
+_BIN_BLOCKS = 8  # blocks of which the most punctual one speaks
+_BINS = 64  # kept
+_SETTLED = 3  # blocks in a row that must agree before a loss is told
+_SPREAD = 64  # blocks of which the scatter is known
+
+
+@dataclass(frozen=True, slots=True)
+class Rate:
+    """Bytes a second as measured.
+
+    Args:
+        bytes_s: of the host's clock.
+        sigma_bytes_s: its standard deviation.
+        span_s: of the fit.
+        ppm: off the nominal rate.
+    """
+
+    bytes_s: float
+    sigma_bytes_s: float
+    span_s: float
+    ppm: float
+
+
+@dataclass(frozen=True, slots=True)
+class Lapse:
+    """A loss seen from the time: about `bytes` are missing, somewhere in the last `suspect` bytes."""
+
+    bytes: int
+    suspect: int
+
+
+class Pace:
+    """Watches one epoch after the other.
+
+    A block that came back late is behind the rate, but later ones make up for it; bytes that were lost stay missing.
+    So the smallest lag of a few blocks is compared with what the epoch has shown so far.
+
+    Args:
+        nominal: bytes a second.
+        tolerance_ppm: how far a camera's crystal may be off before it has been measured.
+
+    Edges:
+        A loss below the scatter of the host's stamps (some bytes when emulated, a few kB on a busy host) is not seen:
+        the tick phase shows it (`framing.find_phase`). A camera that is slower than the tolerance allows is reported as
+        losing all the time: its profile is wrong.
+    """
+
+    def __init__(self, nominal: float, tolerance_ppm: float = 200.0) -> None:
+        self.nominal, self.tolerance = float(nominal), tolerance_ppm * 1e-6
+        self._rate = self.nominal
+        self._drift = self.tolerance  # of the rate in use, relative
+        self._rate_told: Rate | None = None
+        self.begin()
+
+    def begin(self) -> None:
+        """A new epoch; the rate stays known."""
+        self._at: tuple[int, int] | None = None  # the most punctual moment: time and bytes
+        self._lags: list[float] = []
+        self._bins: list[tuple[int, int]] = []
+        self._bin: list[tuple[float, int, int]] = []
+        self._calm: list[float] = []
+        self.sure_bytes = 0  # of this epoch: all before was in time
+        self.total = 0
+
+    def lag(self, now_ns: int, total: int) -> float:
+        """Bytes that should have come by now and did not."""
+        if self._at is None:
+            return 0.0
+        return self._rate * (now_ns - self._at[0]) / NS - (total - self._at[1])
+
+    def add(self, after_ns: int, count: int) -> Lapse | None:
+        """A block came back at `after_ns` with `count` bytes.
+
+        Returns:
+            A loss, once it is certain; the caller then begins a new epoch.
+        """
+        self.total += count
+        if self._at is None:
+            self._at, self.sure_bytes = (after_ns, self.total), self.total
+        lag = self.lag(after_ns, self.total)
+        if lag < 0:  # more punctual than ever
+            self._at = (after_ns, self.total)
+            lag = 0.0
+        self._lags = [*self._lags[1 - _SETTLED :], lag]
+        allowed = self._allowed(after_ns)
+        if lag <= allowed:
+            self.sure_bytes = self.total
+            self._calm = [*self._calm[1 - _SPREAD :], lag]
+        self._fit(lag, after_ns)
+        lowest = min(self._lags)
+        if len(self._lags) < _SETTLED or lowest <= allowed:
+            return None
+        if self._lags[-1] < self._lags[0] - max(allowed / 4, 0.02 * count):  # a backlog that is being read off
+            return None
+        return Lapse(round(lowest), self.total - self.sure_bytes)
+
+    def doubtful(self) -> int:
+        """Bytes at the end that came late and have not been made up for: a loss, or a backlog."""
+        return self.total - self.sure_bytes
+
+    def measured(self) -> Rate | None:
+        """The rate as fitted; None before about half a second."""
+        return self._rate_told
+
+    def _allowed(self, now_ns: int) -> float:
+        """Lag that is no loss: scatter of the stamps, and what the rate may be off since the punctual moment."""
+        assert self._at is not None
+        calm = np.array(self._calm) if len(self._calm) >= 8 else np.array([0.0, self._rate * 200e-6])
+        scatter = float(np.quantile(calm, 0.9) - calm.min())
+        return 64 + 4 * scatter + self._drift * self._rate * (now_ns - self._at[0]) / NS
+
+    def _fit(self, lag: float, after_ns: int) -> None:
+        self._bin.append((lag, after_ns, self.total))
+        if len(self._bin) < _BIN_BLOCKS:
+            return
+        _, at, total = min(self._bin)
+        self._bin = []
+        self._bins = [*self._bins[1 - _BINS :], (at, total)]
+        t = np.array([b[0] - self._bins[0][0] for b in self._bins], np.float64) / NS
+        y = np.array([b[1] - self._bins[0][1] for b in self._bins], np.float64)
+        if len(t) < 6 or t[-1] < 0.4:
+            return
+        i, j = np.triu_indices(len(t), 1)
+        far = t[j] - t[i] > 0.3 * t[-1]
+        slope = float(np.median((y[j] - y[i])[far] / (t[j] - t[i])[far]))
+        rest = y - slope * t
+        sigma = 1.5 * float(np.median(np.abs(rest - np.median(rest)))) / t[-1] + 2.0 / t[-1]
+        self._rate_told = Rate(slope, float(sigma), float(t[-1]), (slope / self.nominal - 1) * 1e6)
+        if slope > self.nominal * (1 - self.tolerance):
+            self._rate, self._drift = slope, max(4 * sigma / slope, 0.02e-6)
+            k = int(np.argmax(rest))  # the most punctual one by the new rate
+            self._at = (self._bins[k][0], self._bins[k][1])
