@@ -60,15 +60,15 @@ class Pace:
         self._rate = self.nominal
         self._drift = self.tolerance  # of the rate in use, relative
         self._rate_told: Rate | None = None
+        self._jumps: list[float] = []  # of the lag from block to block: how punctual the host is
         self.begin()
 
     def begin(self) -> None:
-        """A new epoch; the rate stays known."""
+        """A new epoch; the rate and the host's punctuality stay known."""
         self._at: tuple[int, int] | None = None  # the most punctual moment: time and bytes
         self._lags: list[float] = []
         self._bins: list[tuple[int, int]] = []
         self._bin: list[tuple[float, int, int]] = []
-        self._calm: list[float] = []
         self.sure_bytes = 0  # of this epoch: all before was in time
         self.total = 0
 
@@ -91,11 +91,12 @@ class Pace:
         if lag < 0:  # more punctual than ever
             self._at = (after_ns, self.total)
             lag = 0.0
-        self._lags = [*self._lags[1 - _SETTLED :], lag]
         allowed = self._allowed(after_ns)
         if lag <= allowed:
             self.sure_bytes = self.total
-            self._calm = [*self._calm[1 - _SPREAD :], lag]
+            if self._lags:
+                self._jumps = [*self._jumps[1 - _SPREAD :], abs(lag - self._lags[-1])]
+        self._lags = [*self._lags[1 - _SETTLED :], lag]
         self._fit(lag, after_ns)
         lowest = min(self._lags)
         if len(self._lags) < _SETTLED or lowest <= allowed:
@@ -115,8 +116,8 @@ class Pace:
     def _allowed(self, now_ns: int) -> float:
         """Lag that is no loss: scatter of the stamps, and what the rate may be off since the punctual moment."""
         assert self._at is not None
-        calm = np.array(self._calm) if len(self._calm) >= 8 else np.array([0.0, self._rate * 200e-6])
-        scatter = float(np.quantile(calm, 0.9) - calm.min())
+        known = len(self._jumps) >= 8
+        scatter = float(np.quantile(self._jumps, 0.9)) if known else self._rate * 200e-6
         return 64 + 4 * scatter + self._drift * self._rate * (now_ns - self._at[0]) / NS
 
     def _fit(self, lag: float, after_ns: int) -> None:

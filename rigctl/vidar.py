@@ -71,8 +71,7 @@ class VidarSource:
         self.epoch = -1
         self._turn, self._index, self._streaming = 0, 0, False
         self._why, self._due, self._suspect, self._failed = "", 0, 0, 0
-        self._heard_ns = self._gone_ns = 0
-        self._retry = 0
+        self._heard_ns = self._retry = 0
 
     def start(self) -> None:
         """Begin the stream: flush, stream, throw old bytes away until they come at the camera's own pace."""
@@ -131,7 +130,7 @@ class VidarSource:
     # -- the stream -------------------------------------------------------------------------------------------------
     def _block(self, count: int, before: int, after: int) -> Block:
         """Bytes that came, with their epoch; losses known by now are told with them."""
-        self._failed, self._heard_ns = 0, after
+        self._failed, self._retry, self._heard_ns = 0, 0, after
         lost, why, suspect = 0, self._why, 0
         if why:
             lost, suspect = self._settle(after, count)
@@ -232,29 +231,30 @@ class VidarSource:
 
     # -- going away and coming back ---------------------------------------------------------------------------------
     def _lose(self) -> None:
-        """The device is gone: let go of it and look out for its return."""
+        """The device is gone, or as good as gone: let go of it and look out for its return."""
         self._dispose()
-        self._gone_ns, self._retry = self._host.now_ns(), 0
+        self._failed = 0
 
     def _return(self, until_ns: int) -> bool:
         """Look for a camera that went away until then; True when it is back and streams.
 
         Raises:
-            DeviceError, HostError: it did not come back within the patience.
+            DeviceError: it did not come back within the patience, or came and did not work.
         """
         while True:
             try:
                 device = usbport.pick(self._backend, self.profile, self._wanted)
                 facts = usbport.open_port(device, self.profile)
             except (DeviceError, HostError) as error:  # also no permission: udev comes after the plug
-                self._give_up(error)
+                self._give_up(error.what)
             else:
                 self._device, self.facts = device, dataclasses.replace(facts, serial=facts.serial or self.facts.serial)
                 try:
                     self._begin()
                     return True
-                except OSError:
+                except OSError as error:
                     self._dispose()
+                    self._give_up(str(error))
             wait = _BACKOFF_NS[min(self._retry, len(_BACKOFF_NS) - 1)]
             self._retry += 1
             now = self._host.now_ns()
@@ -262,13 +262,13 @@ class VidarSource:
             if now + wait >= until_ns:
                 return False
 
-    def _give_up(self, error: RigError) -> None:
-        away = self._host.now_ns() - self._gone_ns
+    def _give_up(self, cause: str) -> None:
+        away = self._host.now_ns() - self._heard_ns
         if away > self._patience:
             raise DeviceError(
                 "the spike camera went away and did not come back",
-                value=f"{self._wanted}, {away / NS:.1f} s", cause=error.what, next="check its cable; spikerig rig find",
-            ) from error  # fmt: skip
+                value=f"{self._wanted}, {away / NS:.1f} s", cause=cause, next="check its cable; spikerig rig find",
+            )  # fmt: skip
 
     def _refused(self, error: OSError) -> RigError:
         return usbport.refusal(error, "the stream does not begin", self.profile.vendor, self.profile.product)
