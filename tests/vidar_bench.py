@@ -13,6 +13,7 @@ from spikerig.rigctl.vidar import VidarSource
 
 S, MS = 1_000_000_000, 1_000_000
 K20 = PROFILES["vidar-400x250-20k"]
+MID = WireProfile("mid-128x80", 128, 80, 128, 20_000.0)  # 25.6 MB/s
 SMALL = WireProfile("small-64x40", 64, 40, 64, 20_000.0)
 
 
@@ -25,7 +26,7 @@ class Numbered:
         out.view(np.uint32)[:] = np.arange(start // 4, (start + len(out)) // 4, dtype=np.uint32)
 
 
-def camera(profile=K20, source=None, *, faults=(), ppm=30.0, born_s=1.23456, host=None, **more):
+def camera(profile=MID, source=None, *, faults=(), ppm=30.0, born_s=1.23456, host=None, **more):
     """(host, bus, bridge): a camera whose faults are (kind, at_s, and what else)."""
     host = host or VirtualHost()
     clock = Oscillator(ppm=ppm, walk=1e-8, seed=5)
@@ -34,7 +35,7 @@ def camera(profile=K20, source=None, *, faults=(), ppm=30.0, born_s=1.23456, hos
     return host, EmulatedUsb(host, [bridge]), bridge
 
 
-def opened(profile=K20, **more):
+def opened(profile=MID, **more):
     """(host, bus, bridge, a driver that streams)."""
     host, bus, bridge = camera(profile, **more)
     source = VidarSource(profile, host, bus)

@@ -4,7 +4,7 @@ import errno
 
 import numpy as np
 import pytest
-from vidar_bench import K20, MS, SMALL, S, camera, gaps, opened, record
+from vidar_bench import K20, MID, MS, SMALL, S, camera, gaps, opened, record
 
 from spikerig.dataset.errors import DeviceError, HostError, UsageError
 from spikerig.rigctl import usbport
@@ -37,7 +37,7 @@ def test_a_still_bus_gives_every_byte_in_one_epoch():
     rate = source.measured_rate()
     assert abs(rate.ppm - 30.0) < 0.1
     assert rate.sigma_bytes_s < 100
-    assert abs((rate.bytes_s - K20.bytes_s * (1 + 30e-6))) < 4 * rate.sigma_bytes_s + 1
+    assert abs((rate.bytes_s - MID.bytes_s * (1 + 30e-6))) < 4 * rate.sigma_bytes_s + 1
     assert source.doubtful_bytes == 0
     assert not [c for c in bus.calls if "halt" in c or "reset" in c]  # no reflex
     source.close()
@@ -46,9 +46,9 @@ def test_a_still_bus_gives_every_byte_in_one_epoch():
 
 
 def test_what_lay_in_the_camera_before_the_start_is_thrown_away():
-    host, bus, bridge = camera(ram_bytes=8_000_000)
+    host, bus, bridge = camera(ram_bytes=800_000)
     host.sleep_until(S)
-    source = VidarSource(K20, host, bus)
+    source = VidarSource(MID, host, bus)
     source.start()
     began = host.now_ns()
     block = source.read(100 * MS)
@@ -68,7 +68,7 @@ def test_an_error_in_a_transfer_ends_the_epoch(kind):
     assert (inside, suspect) == ([], [])
     assert between == [sum(losses(bridge).get(k, 0) for k in LOST)]
     assert between[0] > 0
-    assert abs(new.lost_bytes - between[0]) <= 32_768  # from the time; what waits in the memory still counts
+    assert abs(new.lost_bytes - between[0]) <= 16_384 + 4096  # from the time; what waits in the memory still counts
     assert bus.calls.count("clear_halt 0x82") == (1 if kind == "stall" else 0)
 
 
@@ -83,8 +83,8 @@ def test_a_timeout_with_data_is_a_short_read_and_no_loss():
 
 
 def test_a_silent_loss_is_seen_from_the_time_and_its_place_is_bounded():
-    host, _, bridge, source = opened(faults=[{"kind": "drop", "at_s": 1.0, "bytes": 5000}])
-    blocks = record(host, source, 1.4)
+    host, _, bridge, source = opened(K20, faults=[{"kind": "drop", "at_s": 1.0, "bytes": 5000}])
+    blocks = record(host, source, 1.2)
     (new,) = epochs(blocks)
     assert new.lost_why == "rate"
     assert abs(new.lost_bytes - 5000) < 200
@@ -95,16 +95,16 @@ def test_a_silent_loss_is_seen_from_the_time_and_its_place_is_bounded():
 
 def test_a_late_host_without_memory_in_the_camera_loses_and_knows():
     host, _, bridge, source = opened()
-    blocks = record(host, source, 1.4, pauses=[(1.0, 0.001)])
+    blocks = record(host, source, 1.4, pauses=[(1.0, 0.01)])
     (new,) = epochs(blocks)
     lost = losses(bridge)["overflow"]
-    assert abs(lost - (250_000 - 16_384)) < 100
+    assert abs(lost - (256_000 - 16_384)) < 100
     assert gaps(blocks) == ([], [lost], [0])
     assert abs(new.lost_bytes - lost) < 200
 
 
 def test_memory_in_the_camera_bridges_a_late_host():
-    host, _, bridge, source = opened(ram_bytes=32_000_000)
+    host, _, bridge, source = opened(ram_bytes=3_200_000)
     blocks = record(host, source, 2.0, pauses=[(1.0, 0.1)])
     assert gaps(blocks) == ([], [], [])
     assert epochs(blocks) == []
@@ -115,7 +115,7 @@ def test_memory_in_the_camera_bridges_a_late_host():
 def test_a_loss_in_the_last_blocks_is_doubted_at_the_end():
     host, _, _, source = opened()
     blocks = record(host, source, 1.0)
-    host.sleep_until(host.now_ns() + MS)
+    host.sleep_until(host.now_ns() + 2 * MS)
     last = source.read(100 * MS)
     source.stop()
     assert source.doubtful_bytes == len(last.data)
@@ -124,17 +124,17 @@ def test_a_loss_in_the_last_blocks_is_doubted_at_the_end():
     assert len(suspect) == 1
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(12))
 def test_no_loss_is_unseen(seed):
     rng = np.random.default_rng(seed)
     kinds = ["drop", "drop", "stall", "io", "overflow", "short", "interrupted", "unplug", "hang"]
     faults = [
-        {"kind": str(rng.choice(kinds)), "at_s": float(t), "bytes": int(rng.integers(1000, 400_000)), "for_s": 0.13}
+        {"kind": str(rng.choice(kinds)), "at_s": float(t), "bytes": int(rng.integers(1000, 40_000)), "for_s": 0.13}
         for t in 0.7 + np.cumsum(rng.uniform(0.15, 0.4, 6))
     ]
-    pauses = [(float(t), float(10 ** rng.uniform(-4.3, -1.5))) for t in rng.uniform(0.7, 2.8, 5)]
+    pauses = [(float(t), float(10 ** rng.uniform(-3.3, -1.0))) for t in rng.uniform(0.7, 2.8, 5)]
     host, _, bridge, source = opened(
-        faults=faults, ram_bytes=int(rng.choice([0, 1_000_000])), ppm=float(rng.uniform(-60, 60)),
+        faults=faults, ram_bytes=int(rng.choice([0, 100_000])), ppm=float(rng.uniform(-60, 60)),
         turn=Latency(5.0, 3.0), seed=seed,
     )  # fmt: skip
     blocks = record(host, source, 3.6, pauses)
@@ -159,8 +159,8 @@ def test_unplugged_and_back_under_the_same_serial():
     assert new.lost_why == "unplugged"
     inside, suspect, between = gaps(blocks)
     assert (inside, suspect) == ([], [])
-    assert between[0] > 2 * K20.bytes_s
-    assert abs(new.lost_bytes - between[0]) < 32_768
+    assert between[0] > 2 * MID.bytes_s
+    assert abs(new.lost_bytes - between[0]) < 16_384 + 4096
     assert (source.facts.serial, source.facts.address) == ("K10-0007", before.address)
     assert bus.calls == ["claim 0", "claim 1"] * 2
     assert bridge.streaming
@@ -170,7 +170,7 @@ def test_another_camera_is_not_taken_for_the_lost_one():
     host, bus, _ = camera(faults=[{"kind": "unplug", "at_s": 0.5}], serial="A")
     _, other, _ = camera(host=host, serial="B", port=2)
     bus.bridges += other.bridges
-    source = VidarSource(K20, host, bus, serial="A", patience_ns=3 * S)
+    source = VidarSource(MID, host, bus, serial="A", patience_ns=3 * S)
     source.start()
     with pytest.raises(DeviceError, match="did not come back") as told:
         while True:
@@ -188,7 +188,7 @@ def test_back_but_not_yet_permitted_is_waited_for():
     host, _, _, source = opened(faults=faults)
     blocks = record(host, source, 2.5)
     (new,) = epochs(blocks)
-    assert 0.9 * K20.bytes_s < new.lost_bytes < 1.7 * K20.bytes_s
+    assert 0.9 * MID.bytes_s < new.lost_bytes < 1.7 * MID.bytes_s
 
 
 def test_silence_begins_the_stream_again_and_in_the_end_gives_up():
@@ -196,7 +196,7 @@ def test_silence_begins_the_stream_again_and_in_the_end_gives_up():
     blocks = record(host, source, 3.5)
     assert [b.lost_why for b in epochs(blocks)] == ["silence"]
     host, bus, _ = camera(faults=[{"kind": "hang", "at_s": 0.5}])
-    source = VidarSource(K20, host, bus, patience_ns=3 * S)
+    source = VidarSource(MID, host, bus, patience_ns=3 * S)
     source.start()
     with pytest.raises(DeviceError, match="says nothing"):
         while True:
@@ -206,14 +206,14 @@ def test_silence_begins_the_stream_again_and_in_the_end_gives_up():
 def test_busy_names_the_kernel_module():
     host, bus, _ = camera(faults=[{"kind": "busy"}])
     with pytest.raises(DeviceError, match="ft60x") as told:
-        VidarSource(K20, host, bus)
+        VidarSource(MID, host, bus)
     assert told.value.exit_code == 3
 
 
 def test_no_permission_prints_the_rule():
     host, bus, _ = camera(faults=[{"kind": "denied"}])
     with pytest.raises(HostError) as told:
-        VidarSource(K20, host, bus)
+        VidarSource(MID, host, bus)
     assert told.value.exit_code == 6
     assert usbport.udev_rule(0x0403, 0x601F) in told.value.next
     assert '"601f"' in told.value.next
@@ -229,7 +229,7 @@ def test_no_libusb_names_both_cures():
 
 def test_damaged_strings_and_settings_are_lived_with():
     host, bus, _ = camera(faults=[{"kind": "strings"}, {"kind": "config"}])
-    source = VidarSource(K20, host, bus)
+    source = VidarSource(MID, host, bus)
     assert source.facts.serial == ""
     assert "152" in source.facts.more["config"] or "damaged" in source.facts.more["config"]
     source.start()
@@ -242,10 +242,10 @@ def test_two_alike_are_told_apart_by_where_they_are_plugged_in():
     _, other, _ = camera(host=host, port=2)
     bus.bridges += other.bridges
     with pytest.raises(DeviceError, match="more than one") as told:
-        VidarSource(K20, host, bus)
+        VidarSource(MID, host, bus)
     assert "usb:2-1" in str(told.value)
     assert "usb:2-2" in str(told.value)
-    source = VidarSource(K20, host, bus, serial="usb:2-2")
+    source = VidarSource(MID, host, bus, serial="usb:2-2")
     assert source.facts.address == "usb:2-2"
     found, failed = find(host, bus)
     assert sorted(f.address for f in found) == ["usb:2-1", "usb:2-2"] or failed
@@ -256,13 +256,13 @@ def test_nothing_plugged_in_is_told():
     host, bus, _ = camera()
     bus.bridges.clear()
     with pytest.raises(DeviceError, match="no spike camera was found"):
-        VidarSource(K20, host, bus)
+        VidarSource(MID, host, bus)
     assert find(host, bus) == ([], [])
 
 
 def test_misuse_is_told_and_closing_twice_is_fine():
     host, bus, _ = camera()
-    source = VidarSource(K20, host, bus)
+    source = VidarSource(MID, host, bus)
     with pytest.raises(UsageError, match="not started"):
         source.read(MS)
     source.start()
