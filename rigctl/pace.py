@@ -63,14 +63,26 @@ class Pace:
         self._jumps: list[float] = []  # of the lag from block to block: how punctual the host is
         self.begin()
 
-    def begin(self) -> None:
-        """A new epoch; the rate and the host's punctuality stay known."""
-        self._at: tuple[int, int] | None = None  # the most punctual moment: time and bytes
+    def begin(self, at_ns: int | None = None) -> None:
+        """A new epoch; the rate and the host's punctuality stay known.
+
+        Args:
+            at_ns: when nothing waited any more: from then on bytes are counted. None: from the first block's end.
+        """
+        # the most punctual moment: time and bytes
+        self._at: tuple[int, int] | None = None if at_ns is None else (at_ns, 0)
         self._lags: list[float] = []
         self._bins: list[tuple[int, int]] = []
         self._bin: list[tuple[float, int, int]] = []
         self.sure_bytes = 0  # of this epoch: all before was in time
         self.total = 0
+
+    def split(self, lapse: Lapse) -> None:
+        """A new epoch right after a loss that was seen from the time: expectations go on, less what is missing."""
+        at, total = self._at, self.total
+        self.begin()
+        if at is not None:
+            self._at = (at[0], at[1] - total - lapse.bytes)
 
     def lag(self, now_ns: int, total: int) -> float:
         """Bytes that should have come by now and did not."""
@@ -82,7 +94,7 @@ class Pace:
         """A block came back at `after_ns` with `count` bytes.
 
         Returns:
-            A loss, once it is certain; the caller then begins a new epoch.
+            A loss, once it is certain; the caller then goes on with `split`.
         """
         self.total += count
         if self._at is None:
