@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spikerig.dataset.clocktime import NS
 
-_BIN_BLOCKS = 8  # blocks of which the most punctual one speaks
+_KNOWN_S = 2.0  # of pairs' distances together, from which a rate is told
+_BIN_BLOCKS = 4  # blocks of which the most punctual one speaks
 _BINS = 64  # kept
 _SETTLED = 3  # blocks in a row that must agree before a loss is told
 _SPREAD = 64  # blocks of which the scatter is known
@@ -60,6 +62,8 @@ class Pace:
         self._rate = self.nominal
         self._drift = self.tolerance  # of the rate in use, relative
         self._rate_told: Rate | None = None
+        self._piece = 0  # of the record that is whole: between losses
+        self._bins: list[tuple[int, int, int]] = []  # piece, time, bytes
         self._jumps: list[float] = []  # of the lag from block to block: how punctual the host is
         self.begin()
 
@@ -72,7 +76,7 @@ class Pace:
         # the most punctual moment: time and bytes
         self._at: tuple[int, int] | None = None if at_ns is None else (at_ns, 0)
         self._lags: list[float] = []
-        self._bins: list[tuple[int, int]] = []
+        self._piece += 1
         self._bin: list[tuple[float, int, int]] = []
         self.sure_bytes = 0  # of this epoch: all before was in time
         self.total = 0
@@ -138,18 +142,29 @@ class Pace:
             return
         _, at, total = min(self._bin)
         self._bin = []
-        self._bins = [*self._bins[1 - _BINS :], (at, total)]
-        t = np.array([b[0] - self._bins[0][0] for b in self._bins], np.float64) / NS
-        y = np.array([b[1] - self._bins[0][1] for b in self._bins], np.float64)
-        if len(t) < 6 or t[-1] < 0.4:
-            return
+        self._bins = [*self._bins[1 - _BINS :], (self._piece, at, total)]
+        piece, when, count = np.array(self._bins, np.int64).T
+        t, y = (when - when[0]) / NS, (count - count[0]).astype(np.float64)
         i, j = np.triu_indices(len(t), 1)
-        far = t[j] - t[i] > 0.3 * t[-1]
-        slope = float(np.median((y[j] - y[i])[far] / (t[j] - t[i])[far]))
-        rest = y - slope * t
-        sigma = 1.5 * float(np.median(np.abs(rest - np.median(rest)))) / t[-1] + 2.0 / t[-1]
-        self._rate_told = Rate(slope, float(sigma), float(t[-1]), (slope / self.nominal - 1) * 1e6)
+        use = (piece[i] == piece[j]) & (t[j] - t[i] > 0.02)
+        if np.sum((t[j] - t[i])[use]) < _KNOWN_S:
+            return
+        slope = _weighted_median(((y[j] - y[i]) / (t[j] - t[i] + 1e-12))[use], (t[j] - t[i])[use] ** 2)
+        rest, lever = y - slope * t, np.zeros(len(t))
+        for k in np.unique(piece):
+            mine = piece == k
+            rest[mine] -= np.median(rest[mine])
+            lever[mine] = t[mine] - t[mine].mean()
+        sigma = (1.5 * float(np.median(np.abs(rest))) + 1.0) / float(np.sqrt(np.sum(lever**2)))
+        self._rate_told = Rate(slope, sigma, float(t[-1]), (slope / self.nominal - 1) * 1e6)
         if slope > self.nominal * (1 - self.tolerance):
-            self._rate, self._drift = slope, max(4 * sigma / slope, 0.02e-6)
-            k = int(np.argmax(rest))  # the most punctual one by the new rate
-            self._at = (self._bins[k][0], self._bins[k][1])
+            self._rate, self._drift = slope, min(max(4 * sigma / slope, 0.02e-6), self.tolerance)
+            mine = np.flatnonzero(piece == self._piece)
+            k = mine[np.argmax((y - slope * t)[mine])]  # the most punctual one by the new rate
+            self._at = (int(when[k]), int(count[k]))
+
+
+def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
+    order = np.argsort(values)
+    reach = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(reach, reach[-1] / 2)])

@@ -155,13 +155,13 @@ def test_no_loss_is_unseen(seed):
     blocks = record(host, source, 3.6, pauses)
     source.stop()
     inside, suspect, between = gaps(blocks, tail=source.doubtful_bytes)
-    assert inside == []
+    assert all(g < 128 for g in inside)  # 5 us: below what host stamps can tell; the framing tells (test_framing.py)
     truth = bridge.truth(host.now_ns())
     first, end = int(blocks[0][1].view(np.uint32)[0]) * 4, int(blocks[-1][1].view(np.uint32)[-1]) * 4 + 4
     lost = sum(max(0, min(x["stop"], end) - max(x["start"], first)) for x in truth["lost"])
     drained = sum(max(0, min(b, end) - max(a, first)) for a, b in truth["sent"]) - sum(len(d) for _, d in blocks)
     assert sum(len(d) for _, d in blocks) + lost + drained == end - first  # bytes made
-    assert sum(suspect) + sum(between) == lost + drained
+    assert sum(inside) + sum(suspect) + sum(between) == lost + drained
     assert lost > 0
     assert len(epochs(blocks)) >= 3
 
