@@ -153,12 +153,16 @@ def warp_of(
     spike_px = unmirrored(calibration, "spike", project(spike, centre))
     cells = _within(fine, rgb).reshape(height, samples, width, samples).all((1, 3))
     valid = cells & _within(spike_px, spike, rim=0.5)
-    rgb_px = rgb_of(centre)
-    for region in regions:
-        inside = within_polygon(rgb_px if region.arm == "rgb" else spike_px, region.polygon_px)
-        valid &= ~inside
     same = not full and not spike.distortion.any() and calibration.mirrored != "spike"
-    return Warp(camera, spike_px, rgb_px, fine.astype(np.float32), samples, valid, same)
+    return without(Warp(camera, spike_px, rgb_of(centre), fine.astype(np.float32), samples, valid, same), regions)
+
+
+def without(warp: Warp, regions: Sequence[Region]) -> Warp:
+    """A warp whose pixels in some regions are not valid."""
+    if not regions:
+        return warp
+    inside = [within_polygon(warp.rgb_px if r.arm == "rgb" else warp.spike_px, r.polygon_px) for r in regions]
+    return replace(warp, valid=warp.valid & ~np.any(inside, axis=0))
 
 
 def pair(

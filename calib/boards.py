@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.calib.saddle import refine
+from spikerig.calib.saddle import REACH, refine
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.images import srgb_from_linear
 
 Floats = NDArray[np.float64]
 SMALL = 800  # pictures narrower than this are doubled before boards are sought: small squares are found then
+CLEAR = 1.0  # of the way to the corner of the nearest marker
+SMALLEST = 32  # px a side that a picture of a board has at least
 LARGEST = 60  # corners a side
 
 
@@ -47,6 +49,12 @@ class Board:
         if self.charuco:
             return (0,)
         return (0, 1, 2, 3) if self.cols == self.rows else (0, 2)
+
+    @property
+    def free(self) -> float:
+        """How far around a corner nothing but its two edges is to be seen, in squares: markers begin there."""
+        bare = 1 - self.marker_mm / self.square_mm if self.charuco else 1.0
+        return min(REACH, CLEAR * bare / 2**0.5)
 
     def relabelled(self, corners: NDArray[Any], turns: int, mirrored: bool = False) -> NDArray[Any]:
         """Corners [N,...] with the labels of a board turned by quarter turns (or first seen in a mirror)."""
@@ -90,7 +98,7 @@ def board_of(pattern: str, square_mm: float, charuco: str = "", marker_mm: float
     match = re.fullmatch(r"(\d{1,3})[xX×](\d{1,3})", pattern.strip())
     if not match or not all(3 <= int(n) <= LARGEST for n in match.groups()):
         raise UsageError("a pattern is COLSxROWS inner corners", value=pattern, expected="e.g. 9x6, at least 3x3")
-    if not (np.isfinite(square_mm) and 0 < square_mm <= 1e5):
+    if not (np.isfinite(square_mm) and 1e-3 <= square_mm <= 1e5):
         raise UsageError("the edge of a square is a positive length in mm", value=square_mm, expected="e.g. 24")
     if charuco:
         marker_mm = marker_mm or 0.75 * square_mm
@@ -133,7 +141,7 @@ def find(light: NDArray[Any], board: Board) -> Found | None:
     found = _find_charuco(gray, board) if board.charuco else _find_plain(gray, board)
     if found is None:
         return None
-    return replace(found, px=refine(light, found.px, found.seen, board.cols, board.rows))
+    return replace(found, px=refine(light, found.px, found.seen, board.cols, board.rows, board.free))
 
 
 def _find_plain(gray: NDArray[np.uint8], board: Board) -> Found | None:

@@ -35,6 +35,7 @@ def poses(
     shared_camera: Annotated[bool, typer.Option(help="A folder's pictures are of one camera.")] = False,
     seed: Annotated[int, typer.Option(help="Of RANSAC and of the mapper.")] = 1,
     threads: Annotated[int, typer.Option(help="Of features and matches; 0: one a core.")] = 0,
+    sheet: Annotated[Path | None, typer.Option(help="A contact sheet of the scene written (.html).")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace earlier results; keep refused ones.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
 ) -> None:
@@ -54,6 +55,7 @@ def poses(
     )  # fmt: skip
     if out is not None and (out / "poses.json").exists() and not force:
         raise UsageError("there is an earlier result", value=out / "poses.json", next="give --force to replace it")
+    draw = None if sheet is None else _sheet(sheet, bool(write or write_to), force)
     if source.is_dir():
         if write or write_to:
             raise UsageError("--write is for scene files", value=source)
@@ -76,11 +78,24 @@ def poses(
             next="try --peak-threshold 0.0015, other --kinds, or capture more views; --force keeps them, and says so",
         )
     _tell(told)
+    if draw is not None and told.get("written"):
+        draw(Path(told["written"]))
     if as_json:
         emit("spikerig.calib.poses/1", told | ({"error": refused.as_json()} if refused else {}))
         raise typer.Exit(refused.exit_code if refused else 0)
     if refused:
         raise refused
+
+
+def _sheet(out: Path, writes: bool, force: bool) -> Any:
+    """What draws the contact sheet of the scene written; a wish that cannot be met is refused before the work."""
+    from spikerig.calib.pose_sheet import write_sheet
+    from spikerig.dataset.outfile import refuse_existing
+
+    if not writes:
+        raise UsageError("a sheet shows the scene that was written", value=out, next="give --write or --write-to")
+    refuse_existing(out, force)
+    return lambda scene: write_sheet(scene, out, force=force)
 
 
 def _scene(
@@ -161,11 +176,21 @@ def report(estimate: Any, options: Any) -> dict[str, Any]:
         "paths": len(estimate.paths),
         "path_chi2": {n: p.chi2 for n, p in sorted(estimate.paths.items())},
         "observations": dict(sorted(inliers.items())),
+        "residual_px": {n: p.error_px for n, p in sorted(best.poses.items()) if p.error_px is not None},
+        "point_residuals": quantiles(best.error),
         "poses": {n: p.tolist() for n, p in sorted(estimate.poses.items())},
         "options": asdict(options),
         "versions": {"pycolmap": best.version},
         "seconds": dict(estimate.seconds or best.seconds),
     }
+
+
+def quantiles(values: Any, count: int = 200) -> list[float]:
+    """That many quantiles, evenly spread; all values where there are fewer."""
+    import numpy as np
+
+    at = np.sort(np.asarray(values, np.float64))
+    return at.tolist() if len(at) <= count else np.quantile(at, (np.arange(count) + 0.5) / count).tolist()
 
 
 def against(estimate: Any, known: dict[str, Any]) -> dict[str, Any] | None:

@@ -21,6 +21,7 @@ from spikerig.dataset.spikes import SpikeStream
 Floats = NDArray[np.float64]
 Split = Literal["train", "test"]
 PointSource = Literal["sfm", "simulator", "given", "random"]
+ERROR, WARNING, NOTE = "error", "warning", "note"  # how grave a Finding is
 
 
 def _set(record: object, name: str, dtype: type) -> None:
@@ -254,7 +255,7 @@ class Scene:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What a check found: its name, importance (critical, violation, suggestion), where, the message, and the fix."""
+    """What a check found: its name, importance (error, warning, note), where, the message, and the fix."""
 
     check: str
     importance: str

@@ -163,6 +163,18 @@ class SceneFile:
         lost = np.clip(lost - (t0 or 0), 0, len(bits))
         return SpikeStream(bits, width, rate_hz, t0_ns, clock, lost[lost[:, 0] < lost[:, 1]])
 
+    def has_spikes(self, name: str) -> bool:
+        """Whether a view has spikes."""
+        group = self._group(name)
+        with hdf5_faults(self.path):
+            return has(group, "spikes")
+
+    def ticks(self, name: str) -> int:
+        """How many ticks of spikes a view has; 0 without."""
+        group = self._group(name)
+        with hdf5_faults(self.path):
+            return dataset_at(group, "spikes").shape[0] if has(group, "spikes") else 0
+
     def has_events(self, name: str) -> bool:
         """Whether an event camera saw this view too."""
         group = self._group(name)
@@ -254,7 +266,7 @@ class SceneFile:
         with hdf5_faults(self.path):
             for name in self.names:
                 group = self._group(name)
-                ticks[name] = dataset_at(group, "spikes").shape[0] if has(group, "spikes") else 0
+                ticks[name] = self.ticks(name)
                 if has(group, "events"):
                     events[name] = count_events(group_at(group, "events"))
             points = self.points

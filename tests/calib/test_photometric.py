@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from calib_rigs import rig
 
-from spikerig.calib.flat import FlatField, flattened, read_flat, write_flat
 from spikerig.calib.photometric import Level, count_level, flat_field
 from spikerig.calib.response import fit_response, rgb_mean
 from spikerig.calib.rig import read_calibration, write_calibration
 from spikerig.dataset import cli
 from spikerig.dataset.errors import DataError, UsageError
+from spikerig.dataset.flat import FlatField, flattened, read_flat, write_flat
 from spikerig.dataset.images import srgb8_from_linear, write_image
 from spikerig.dataset.kernels import fire
 from spikerig.dataset.spikes import SpikeStream, open_spikes, write_spikes
