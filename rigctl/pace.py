@@ -13,6 +13,8 @@ _KNOWN_S = 2.0  # of pairs' distances together, from which a rate is told
 _BIN_BLOCKS = 4  # blocks of which the most punctual one speaks
 _BINS = 64  # kept
 _SETTLED = 3  # blocks in a row that must agree before a loss is told
+_QUICK = 0.9  # of the time in which the camera makes a block's bytes
+_ODD = 1e-3  # no crystal is so far off: a rate like that is not taken over
 _SPREAD = 64  # blocks of which the scatter is known
 
 
@@ -54,7 +56,7 @@ class Pace:
     Edges:
         A loss below the scatter of the host's stamps (some bytes when emulated, a few kB on a busy host) is not seen:
         the tick phase shows it (`framing.find_phase`). A camera that is slower than the tolerance allows is reported as
-        losing all the time: its profile is wrong.
+        losing all the time, and one that is faster hides losses: `measured` tells, and the profile is wrong.
     """
 
     def __init__(self, nominal: float, tolerance_ppm: float = 200.0) -> None:
@@ -94,8 +96,8 @@ class Pace:
             return 0.0
         return self._rate * (now_ns - self._at[0]) / NS - (total - self._at[1])
 
-    def add(self, after_ns: int, count: int) -> Lapse | None:
-        """A block came back at `after_ns` with `count` bytes.
+    def add(self, before_ns: int, after_ns: int, count: int) -> Lapse | None:
+        """A block asked for at `before_ns` came back at `after_ns` with `count` bytes.
 
         Returns:
             A loss, once it is certain; the caller then goes on with `split`.
@@ -110,14 +112,20 @@ class Pace:
         allowed = self._allowed(after_ns)
         if lag <= allowed:
             self.sure_bytes = self.total
-            if self._lags:
+            if self._lags:  # of blocks that waited for the camera
                 self._jumps = [*self._jumps[1 - _SPREAD :], abs(lag - self._lags[-1])]
         self._lags = [*self._lags[1 - _SETTLED :], lag]
-        self._fit(lag, after_ns)
-        lowest = min(self._lags)
+        self._fit(lag, after_ns, lag <= allowed)
+        if (
+            after_ns - before_ns
+        ) * self._rate < _QUICK * count * NS:  # faster than they are made: a backlog is read off
+            self._lags = []
+        lowest = min(self._lags, default=0.0)
         if len(self._lags) < _SETTLED or lowest <= allowed:
             return None
-        if self._lags[-1] < self._lags[0] - max(allowed / 4, 0.02 * count):  # a backlog that is being read off
+        if self._lags[-1] < self._lags[0] - max(
+            allowed / 4, 0.02 * count
+        ):  # a backlog, on a link that is hardly faster
             return None
         return Lapse(round(lowest), self.total - self.sure_bytes)
 
@@ -136,8 +144,9 @@ class Pace:
         scatter = float(np.quantile(self._jumps, 0.9)) if known else self._rate * 200e-6
         return 64 + 4 * scatter + self._drift * self._rate * (now_ns - self._at[0]) / NS
 
-    def _fit(self, lag: float, after_ns: int) -> None:
-        self._bin.append((lag, after_ns, self.total))
+    def _fit(self, lag: float, after_ns: int, in_time: bool) -> None:
+        if in_time:
+            self._bin.append((lag, after_ns, self.total))
         if len(self._bin) < _BIN_BLOCKS:
             return
         _, at, total = min(self._bin)
@@ -156,8 +165,10 @@ class Pace:
             rest[mine] -= np.median(rest[mine])
             lever[mine] = t[mine] - t[mine].mean()
         sigma = (1.5 * float(np.median(np.abs(rest))) + 1.0) / float(np.sqrt(np.sum(lever**2)))
+        if 4 * sigma > _ODD * slope:
+            return
         self._rate_told = Rate(slope, sigma, float(t[-1]), (slope / self.nominal - 1) * 1e6)
-        if slope > self.nominal * (1 - self.tolerance):
+        if abs(slope / self.nominal - 1) < _ODD:
             self._rate, self._drift = slope, min(max(4 * sigma / slope, 0.02e-6), self.tolerance)
             mine = np.flatnonzero(piece == self._piece)
             k = mine[np.argmax((y - slope * t)[mine])]  # the most punctual one by the new rate

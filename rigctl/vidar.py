@@ -136,7 +136,7 @@ class VidarSource:
         self._turn ^= 1
         block = Block(data, self.epoch, self._index, before, after, *self._loss)
         self._index, self._loss = self._index + count, (0, "", 0)
-        lapse = self.pace.add(after, count)
+        lapse = self.pace.add(before, after, count)
         if lapse is not None:  # known from now on: this block still belongs to the old epoch, at its suspect end
             self._loss = (lapse.bytes, "rate", lapse.suspect)
             self.epoch, self._index = self.epoch + 1, 0

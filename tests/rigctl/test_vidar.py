@@ -10,6 +10,7 @@ from vidar_bench import K20, MID, MS, SMALL, S, camera, gaps, opened, record
 from spikerig.dataset.errors import DeviceError, HostError, UsageError
 from spikerig.rigctl import usbport
 from spikerig.rigctl.sim.emulate.latency import Latency
+from spikerig.rigctl.sim.emulate.virtual import VirtualHost
 from spikerig.rigctl.vidar import VidarSource, find
 
 LOST = ("overflow", "drop", "stall", "io", "interrupted", "unplug")
@@ -125,6 +126,39 @@ def test_memory_in_the_camera_bridges_a_late_host():
     assert epochs(blocks) == []
     assert "overflow" not in losses(bridge)
     assert source.doubtful_bytes == 0
+
+
+class BusyHost(VirtualHost):
+    """A host that wakes late: by some hundred microseconds, and now and then by tens of milliseconds."""
+
+    def __init__(self, seed):
+        super().__init__()
+        self.rng = np.random.default_rng(seed)
+
+    def sleep_until(self, at_ns):
+        late = self.rng.exponential(2e5) + (self.rng.random() < 0.05) * self.rng.exponential(2e7)
+        super().sleep_until(at_ns + round(late))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_busy_host_sees_no_loss_where_there_is_none(seed):
+    host, _, bridge, source = opened(host=BusyHost(seed), ram_bytes=16_000_000)
+    blocks = record(host, source, 8.0)
+    assert "overflow" not in losses(bridge)
+    assert epochs(blocks) == []
+    assert abs(source.measured_rate().ppm - 30.0) < 5 * max(1, source.measured_rate().sigma_bytes_s / MID.bytes_s * 1e6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_busy_host_misses_no_loss_of_some_milliseconds(seed):
+    faults = [{"kind": "drop", "at_s": 2.0 + k, "bytes": 200_000} for k in range(6)]
+    host, _, _, source = opened(host=BusyHost(seed), ram_bytes=16_000_000, faults=faults)
+    blocks = record(host, source, 8.5)
+    inside, suspect, _ = gaps(blocks, tail=source.doubtful_bytes)
+    assert inside == []
+    assert suspect == [200_000] * 6
+    assert [b.lost_why for b in epochs(blocks)] == ["rate"] * 6
+    assert all(abs(b.lost_bytes - 200_000) < 20_000 for b in epochs(blocks))
 
 
 def test_a_loss_in_the_last_blocks_is_doubted_at_the_end():
