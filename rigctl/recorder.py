@@ -189,6 +189,11 @@ class Recorder:
             ring.slots, ring.high_water, self._lost_transport, self._lost_recorder, self._trouble,
         )  # fmt: skip
 
+    @property
+    def dead(self) -> bool:
+        """No byte will be read or written any more: the reader ended, or the disk failed."""
+        return bool(self._trouble) and self._trouble != SLOW
+
     def progress(self) -> list[tuple[int, int, int]]:
         """New since the last call: (epoch, bytes of it, host time after), the most punctual transfer of each 50 ms."""
         with self._lock:
