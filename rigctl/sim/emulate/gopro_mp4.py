@@ -48,7 +48,7 @@ class Recording:
     true_ns: int
     frames: int
     fps: Fraction = Fraction(120000, 1001)
-    exposure_s: float | Sequence[float] = 1 / 480
+    exposure_s: float | Sequence[float] | NDArray[np.float64] = 1 / 480
     srot_ms: float = 7.0
     lead_us: int = 85_608
     skipped: tuple[int, ...] = ()
@@ -116,7 +116,7 @@ def _encode(path: Path, take: Recording, first: int, pictures: Pictures, most_by
     except ImportError as error:
         raise HostError("the emulated camera needs PyAV", next='pip install "spikerig[video]"') from error
     starts, exposures = take.true_starts_ns, take.exposures_s
-    bytes_, done = 0, 0
+    bytes_ = done = height = 0
     tuning = {"preset": "ultrafast", "crf": "16", "bf": "0", "g": str(KEY_FRAME), "x264-params": "scenecut=0"}
     scale = {"video_track_timescale": str(take.fps.numerator)}
     with av.open(str(path), "w", format="mp4", options=scale) as container:
