@@ -105,8 +105,8 @@ def _scene(
 
     from spikerig.calib.posed_scene import write_poses
     from spikerig.calib.poses import estimate_poses
-    from spikerig.dataset.provenance import origin_of
     from spikerig.calib.straight import straight_of
+    from spikerig.dataset.provenance import origin_of
     from spikerig.dataset.store import open_scene
 
     with open_scene(source) as scene:
