@@ -111,7 +111,7 @@ class SceneDataset(Dataset[dict[str, Any]]):
             item[name], item[f"{name}_known"] = torch.from_numpy(light), torch.from_numpy(known)
         return item
 
-    def _texture(self, view: View, name: str, at_ns: list[float]) -> tuple[np.ndarray, np.ndarray]:
+    def _texture(self, view: View, name: str, at_ns: list[int]) -> tuple[np.ndarray, np.ndarray]:
         if view.spikes is None:
             shape = (len(at_ns), *view.valid.shape)
             return np.zeros(shape, np.float32), np.zeros(shape, bool)

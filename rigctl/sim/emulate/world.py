@@ -96,7 +96,7 @@ class World:
         number = self.number_at(true_ns)
         if number not in self._gray:
             weights = np.asarray(self.spec.sensor.response, np.float32) * np.float32(self.spec.sensor.gain)
-            self._gray[number] = self.pictures(number) @ weights
+            self._gray[number] = np.asarray(self.pictures(number) @ weights, np.float32)
             while len(self._gray) > KEPT:
                 self._gray.popitem(last=False)
         return _between(self._gray[number], float(self.phase_at(true_ns)))
