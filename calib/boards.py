@@ -204,7 +204,7 @@ def _find_charuco(gray: NDArray[np.uint8], board: Board) -> Found | None:
     return None
 
 
-def _find_pattern(gray: NDArray[np.uint8], board: Board, old: bool) -> Found | None:
+def _find_pattern(gray: NDArray[Any], board: Board, old: bool) -> Found | None:
     import cv2
 
     made = cv2.aruco.CharucoBoard(
