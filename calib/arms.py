@@ -56,7 +56,9 @@ class Arms:
 
     def tfi(self) -> Texture:
         """TFI at mid-exposure of the middle row."""
-        at = float(np.clip(self.stream.tick_at(self.frame.mid_ns), 0, self.stream.ticks))
+        frame, middle = self.frame, float(np.median(self.rows[len(self.rows) // 2]))
+        at_ns = frame.start_ns + round(frame.row_ns * middle + frame.exposure_ns / 2)
+        at = float(np.clip(self.stream.tick_at(at_ns), 0, self.stream.ticks))
         return self._seen(tfi(self.stream, at))
 
     def aligned(self, valid: NDArray[np.bool_]) -> Aligned:
