@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,6 +29,7 @@ from spikerig.calib.rig import RigCalibration, as_json
 from spikerig.calib.rolling import exposure_texture
 from spikerig.dataset.errors import RefusedError, UsageError
 from spikerig.dataset.flat import FlatField, flattened
+from spikerig.dataset.outfile import refuse_existing, stand_in
 from spikerig.dataset.scene import Truth, View
 from spikerig.dataset.store import SceneFile, open_scene
 from spikerig.dataset.texture import Texture
@@ -167,28 +167,22 @@ def write_aligned(
     from spikerig.dataset.store import SceneWriter
 
     target = out or path
-    if out is not None and out.exists() and not force:
-        raise UsageError("the file exists already", value=out, next="give --force to replace it")
-    beside = target.with_name(f".{target.stem}.align.{os.getpid()}{target.suffix}")
-    with open_scene(path) as scene:
+    if out is not None:
+        refuse_existing(out, force)
+    with open_scene(path) as scene, stand_in(target, "align") as beside:
         same = same_camera(scene, checked.warp)
         truth = scene.truth
         if truth is not None and not same:
             truth = replace(truth, light={})
-        try:
-            with SceneWriter(
-                beside, scene.name, checked.warp.camera, light_gain=calibration.split_ratio or scene.light_gain,
-                info={**scene.info, "align": provenance}, points=scene.points, clock=scene.clock,
-                calibration={**as_json(calibration), "id": calibration.id}, truth=truth, keep=False,
-            ) as writer:  # fmt: skip
-                for name in scene.names:
-                    writer.add(
-                        _aligned_view(scene.view(name), checked.warp_of(name)), **_truth(scene, name, truth, same)
-                    )
-                    done()
-            os.replace(beside, target)
-        finally:
-            beside.unlink(missing_ok=True)
+        with SceneWriter(
+            beside, scene.name, checked.warp.camera, light_gain=calibration.split_ratio or scene.light_gain,
+            info={**scene.info, "align": provenance}, points=scene.points, clock=scene.clock,
+            calibration={**as_json(calibration), "id": calibration.id}, truth=truth, keep=False,
+        ) as writer:  # fmt: skip
+            for name in scene.names:
+                warp = checked.warp_of(name)
+                writer.add(_aligned_view(scene.view(name), warp), **_truth(scene, name, truth, same))
+                done()
     return {"written": str(target), "true_light_kept": bool(same and scene.has_truth)}
 
 
