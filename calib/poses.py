@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 from spikerig.calib.consensus import Path, agree, apart_by, averaged, paths_through
 from spikerig.calib.gauge import centres, extent
 from spikerig.calib.mapping import Map, Options, build_map
+from spikerig.calib.pattern import fixed_pattern
 from spikerig.calib.pictures import KINDS, Looks, frame_picture, looks, picture_of, texture_of
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.scene import Camera, View
 
 Floats = NDArray[np.float64]
 LOOKED_AT = 6  # views on which the kinds of texture are judged
+APART = (0.2, 0.8)  # phases of the two instants that features are compared between: windows share no spike
 # A free focal length that is off by the first, and takes the second of the residual with it, says that K is wrong.
 WRONG_FOCAL = ((0.05, 0.02), (0.2, 0.003))
 HARDER = Options(peak_threshold=0.0015, max_ratio=0.85)
@@ -29,11 +31,12 @@ class Wanted:
 
     Args:
         arms: pictures of the `spike` arm, of `rgb`, or of `both` as a COLMAP rig of fixed relative pose.
-        kinds: of texture; empty chooses by measured sharpness and noise.
+        kinds: of texture; empty chooses by how many features are found again, and how near (sharpness and noise).
         maps: how many kinds of texture are mapped independently; two or more can disagree, and then nothing is kept.
         instants: poses over each exposure, ends included; 1 gives the middle alone.
         min_share: of the views that must be placed.
         max_error_px: mean residual above which a map is refused.
+        pattern: the sensor's fixed pattern, measured on the views themselves, is divided out of their textures.
     """
 
     arms: str = "spike"
@@ -42,6 +45,7 @@ class Wanted:
     instants: int = 5
     min_share: float = 0.8
     max_error_px: float = 1.5
+    pattern: bool = True
 
     def __post_init__(self) -> None:
         if self.arms not in ("spike", "rgb", "both"):
@@ -66,6 +70,7 @@ class Estimate:
         agreement_deg, agreement_share: largest median difference between the maps that agree.
         agreeing: how many of the maps agree with the best, itself included, and how many there were.
         reasons: why it is refused; empty when it is not.
+        pattern_sd: of the fixed pattern that was divided out (a share of the light); None: nothing was.
     """
 
     images: tuple[str, ...]
@@ -79,6 +84,7 @@ class Estimate:
     agreeing: tuple[int, int] = (1, 1)
     reasons: tuple[str, ...] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)
+    pattern_sd: float | None = None
 
 
 def estimate_poses(
@@ -121,9 +127,11 @@ def estimate_poses(
         pictures = {v.name: frame_picture(v.frame) for v in usable}
         found = build_map(pictures, rgb_camera or camera, options, keep=keep, done=done)
         return _judged(Estimate(names, {n: p.pose for n, p in found.poses.items()}, {}, found, ("rgb",)), wanted)
-    ranked = _ranked(usable, wanted)
+    gain = gain_of(usable) if wanted.pattern else None
+    ranked = _ranked(usable, wanted, gain)
+    done("textures ranked")
     kinds = wanted.kinds or tuple(look.kind for look in ranked)
-    rigged = _Rigged(usable, camera, wanted, options, rgb_camera or camera, spike_from_rgb, keep, done)
+    rigged = _Rigged(usable, camera, wanted, options, rgb_camera or camera, spike_from_rgb, keep, done, gain)
     maps: dict[str, Map] = {}
     for kind in kinds[: wanted.maps]:
         maps[kind] = rigged.map(kind, first=not maps)
@@ -152,21 +160,23 @@ class _Rigged:
         spike_from_rgb: Floats | None,
         keep: Any,
         done: Callable[[str], None],
+        gain: Floats | None,
     ) -> None:
         self.views, self.camera, self.wanted, self.options = views, camera, wanted, options
         self.rgb_camera, self.spike_from_rgb, self.keep, self.done = rgb_camera, spike_from_rgb, keep, done
+        self.gain = gain
         self.phases = np.linspace(0, 1, wanted.instants) if wanted.instants > 1 else np.array([0.5])
 
     def map(self, kind: str, first: bool = False) -> Map:
         """Map the middle instants by one kind of texture; the first map also takes the further instants."""
         folder = "spike/" if self.wanted.arms == "both" else ""
-        pictures = {f"{folder}{v.name}": look_at(v, 0.5, kind) for v in self.views}
+        pictures = {f"{folder}{v.name}": look_at(v, 0.5, kind, self.gain) for v in self.views}
         further = {}
         if first and self.wanted.instants > 1:
             for v in self.views:
                 for k, phase in enumerate(self.phases):
                     if abs(phase - 0.5) > 1e-9:
-                        picture = look_at(v, phase, kind)
+                        picture = look_at(v, phase, kind, self.gain)
                         further[f"{folder}{v.name}.at{k:03d}"] = (f"{folder}{v.name}", picture)
         rig = None
         if self.wanted.arms == "both":
@@ -224,14 +234,22 @@ def quaternion(R: Floats) -> Floats:
     return q if q[0] >= 0 else -q
 
 
-def look_at(view: View, phase: float, kind: str) -> NDArray[np.uint8]:
-    """The picture of a view by a kind of texture, at a phase of the exposure."""
+def gain_of(views: Sequence[View]) -> Floats | None:
+    """The fixed pattern of the views' sensor, where there are views enough to tell it."""
+    return fixed_pattern([v.spikes for v in views if v.spikes is not None])
+
+
+def look_at(view: View, phase: float, kind: str, gain: Floats | None = None) -> NDArray[np.uint8]:
+    """The picture of a view by a kind of texture, at a phase of the exposure; light is divided by the gain."""
     if view.spikes is None:
         raise UsageError("this view has no spikes", value=view.name)
     if kind[:3] == "tfp" and kind[3:].isdigit() and int(kind[3:]) > view.spikes.ticks:
         told = f"{view.name}, {kind}: {view.spikes.ticks} ticks"
         raise UsageError("a texture does not fit the spikes", value=told, next="ask for a shorter window")
-    return picture_of(texture_of(view.spikes, tick_at(view, phase), kind))
+    texture = texture_of(view.spikes, tick_at(view, phase), kind)
+    if gain is not None:
+        texture = replace(texture, light=(texture.light / gain).astype(np.float32))
+    return picture_of(texture)
 
 
 def tick_at(view: View, phase: float) -> float:
@@ -243,13 +261,16 @@ def tick_at(view: View, phase: float) -> float:
     return float((start + phase * frame.exposure_ns - spikes.t0_ns) * spikes.rate_hz * 1e-9)
 
 
-def _ranked(views: Sequence[View], wanted: Wanted) -> tuple[Looks, ...]:
+def _ranked(views: Sequence[View], wanted: Wanted, gain: Floats | None) -> tuple[Looks, ...]:
     """Kinds of texture, best first, as measured on a few views; kinds whose window leaves the spikes are left out."""
+    if len(wanted.kinds) == 1:
+        return ()
     some = [views[k] for k in np.unique(np.linspace(0, len(views) - 1, LOOKED_AT).round().astype(int))]
     found = []
     for kind in wanted.kinds or KINDS:
         try:
-            found.append(looks([look_at(v, 0.5, kind) for v in some], kind))
+            pairs = [(look_at(v, APART[0], kind, gain), look_at(v, APART[1], kind, gain)) for v in some]
+            found.append(looks([p for pair in pairs for p in pair], kind, pairs))
         except UsageError:
             if wanted.kinds:
                 raise
@@ -258,9 +279,9 @@ def _ranked(views: Sequence[View], wanted: Wanted) -> tuple[Looks, ...]:
     return tuple(sorted(found, key=lambda look: -look.score))
 
 
-def best_kind(views: Sequence[View]) -> str:
-    """The kind of texture that looks best on these views, by measured sharpness and noise."""
-    return _ranked(views, Wanted())[0].kind
+def best_kind(views: Sequence[View], gain: Floats | None = None) -> str:
+    """The kind of texture whose features are found again best on these views."""
+    return _ranked(views, Wanted(), gain)[0].kind
 
 
 def _arm(found: Map, folder: str) -> Map:
@@ -301,6 +322,7 @@ def _settled(rigged: _Rigged, maps: Mapping[str, Map], names: tuple[str, ...], r
         (len(group), len(maps)),
         (),
         seconds,
+        None if rigged.gain is None else float(np.std(np.log(rigged.gain))),
     )
 
 
