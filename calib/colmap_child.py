@@ -51,15 +51,17 @@ def main(path: str) -> None:
     lap("mapping")
     if models:
         best = _largest(models)
+        sparse = root / "sparse"
+        sparse.mkdir(exist_ok=True)
+        if job["camera"] and job.get("doubt_focal"):
+            best.write_text(str(sparse))
+            told["focal"] = _focal(sparse)
+            lap("focal length")
         if job["camera"] or job.get("rig"):
             _adjust(best)
         told |= _model(best, root)
-        sparse = root / "sparse"
-        sparse.mkdir(exist_ok=True)
         best.write_text(str(sparse))
-        if job["camera"] and job.get("doubt_focal"):
-            told["focal"] = _focal(sparse)
-            lap("focal length")
+        lap("adjusting")
         if job["place"]:
             told["placed"] = _place(job, root, database, best)
             lap("localising")
@@ -148,7 +150,7 @@ def _largest(models: list[Any]) -> Any:
     return max(models, key=_size)
 
 
-def _adjust(model: Any, free_focal: bool = False) -> None:
+def _adjust(model: Any) -> None:
     """Adjust poses and points once more, with weights of Cauchy: least squares follow the worst features.
 
     The scale is the median residual of the points, so that the better half counts almost fully.
@@ -159,8 +161,7 @@ def _adjust(model: Any, free_focal: bool = False) -> None:
     if len(errors) < 8:
         return
     options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = free_focal
-    options.refine_principal_point = options.refine_extra_params = False
+    options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
     options.refine_sensor_from_rig = options.print_summary = False
     options.ceres.solver_options.num_threads = 1
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
@@ -250,7 +251,12 @@ def _focal(sparse: Path) -> dict[str, float]:
             if abs(stretch - 1) < 0.01:
                 camera.model = pycolmap.CameraModelId.SIMPLE_PINHOLE
                 camera.params = [given[key], *camera.params[2:]]
-    _adjust(model, free_focal=True)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = True
+    options.refine_principal_point = options.refine_extra_params = options.print_summary = False
+    options.ceres.solver_options.num_threads = 1
+    pycolmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()
     after = float(model.compute_mean_reprojection_error())
     ratios = [float(camera.mean_focal_length()) / given[key] for key, camera in model.cameras.items()]
     return {"ratio": max(ratios, key=lambda r: abs(r - 1)), "saved": 1 - after / max(before, 1e-12)}

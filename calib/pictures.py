@@ -112,7 +112,7 @@ def refound(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> tuple[int, float]:
     """
     import cv2
 
-    sift = cv2.SIFT_create(contrastThreshold=0.01)  # a third of this is COLMAP's peak threshold
+    sift = cv2.SIFT.create(contrastThreshold=0.01)  # a third of this is COLMAP's peak threshold
     points, words = zip(*(sift.detectAndCompute(np.ascontiguousarray(p), None) for p in (a, b)), strict=True)  # pyright: ignore
     if any(w is None or len(w) < 8 for w in words):
         return 0, REFOUND_PX

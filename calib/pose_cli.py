@@ -18,7 +18,9 @@ def poses(
     write: Annotated[bool, typer.Option("--write", help="Put the poses into the scene, in place.")] = False,
     write_to: Annotated[Path | None, typer.Option(help="Put the poses into a copy of the scene.")] = None,
     arms: Annotated[str, typer.Option(help="spike, rgb, or both (a rig of fixed relative pose).")] = "spike",
-    kinds: Annotated[str, typer.Option(help="Textures, e.g. tfp96,adaptive; default: by sharpness and noise.")] = "",
+    kinds: Annotated[
+        str, typer.Option(help="Textures, e.g. tfp96,adaptive; default: whose features are found again best.")
+    ] = "",
     maps: Annotated[int, typer.Option(help="Kinds mapped independently; they must agree.")] = 3,
     instants: Annotated[int, typer.Option(help="Poses over each exposure; 1: the middle alone.")] = 5,
     min_share: Annotated[float, typer.Option(help="Of the views that must be placed.")] = 0.8,
@@ -32,6 +34,8 @@ def poses(
     ] = None,
     max_features: Annotated[int, typer.Option(help="A picture.")] = 4096,
     max_image_size: Annotated[int, typer.Option(help="Longer sides are made smaller; -1: never.")] = -1,
+    tries: Annotated[int, typer.Option(min=1, max=9, help="At mapping; the largest map is kept.")] = 2,
+    pattern: Annotated[bool, typer.Option(help="Divide out the sensor's fixed pattern, as the views show it.")] = True,
     shared_camera: Annotated[bool, typer.Option(help="A folder's pictures are of one camera.")] = False,
     seed: Annotated[int, typer.Option(help="Of RANSAC and of the mapper.")] = 1,
     threads: Annotated[int, typer.Option(help="Of features and matches; 0: one a core.")] = 0,
@@ -50,7 +54,7 @@ def poses(
     off = off if max_error_px is None else max_error_px
     options = Options(
         peak if peak_threshold is None else peak_threshold, max_features, pairs=pairs, mapper=mapper, seed=seed,
-        threads=threads, max_error_px=off, max_image_size=max_image_size,
+        threads=threads, max_error_px=off, max_image_size=max_image_size, tries=tries,
     )  # fmt: skip
     if out is not None and (out / "poses.json").exists() and not force:
         raise UsageError("there is an earlier result", value=out / "poses.json", next="give --force to replace it")
@@ -62,7 +66,7 @@ def poses(
         if write and write_to:
             raise UsageError("give --write or --write-to, not both")
         listed = tuple(k for k in kinds.split(",") if k)
-        wanted = Wanted(arms, listed, min(maps, len(listed)) if listed else maps, instants, min_share, off)
+        wanted = Wanted(arms, listed, min(maps, len(listed)) if listed else maps, instants, min_share, off, pattern)
         told = _scene(source, out, wanted, options, write, write_to, force)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
@@ -151,7 +155,11 @@ def report(estimate: Any, options: Any) -> dict[str, Any]:
         "points": len(best.xyz),
         "free_focal": dict(best.focal) or None,
         "kinds": list(estimate.kinds),
-        "textures": [{"kind": k.kind, "sharpness": k.sharpness, "noise": k.noise} for k in estimate.looked],
+        "textures": [
+            {"kind": k.kind, "sharpness": k.sharpness, "noise": k.noise, "refound": k.refound, "spread_px": k.spread}
+            for k in estimate.looked
+        ],
+        "pattern_sd": estimate.pattern_sd,
         "agreement": {
             "maps": estimate.agreeing[1],
             "agree": estimate.agreeing[0],
