@@ -42,7 +42,7 @@ def main(path: str) -> None:
     if job.get("rig"):
         _rig(job, database)
     lap("features")
-    _match(job, root, database, _pairs(job) if job["place"] else job["pairs"])
+    _match(job, root, database, _pairs(job))
     lap("matches")
     tries = [_map(job, root, database, k) for k in range(job.get("tries", 1))]
     told["tries"] = [_size(_largest(models)) if models else (0, 0) for models in tries]
@@ -106,7 +106,7 @@ def _rig(job: dict[str, Any], database: Path) -> None:
     opened.close()
 
 
-def _match(job: dict[str, Any], root: Path, database: Path, pairs: Any) -> None:
+def _match(job: dict[str, Any], root: Path, database: Path, pairs: list[tuple[str, str]]) -> None:
     import pycolmap
 
     matching = pycolmap.FeatureMatchingOptions()
@@ -117,16 +117,10 @@ def _match(job: dict[str, Any], root: Path, database: Path, pairs: Any) -> None:
     verification.ransac.random_seed = job["seed"]
     verification.ransac.max_error = job["max_error_px"]
     options = {"matching_options": matching, "verification_options": verification}
-    if pairs == "exhaustive":
-        pycolmap.match_exhaustive(database, **options)
-    elif pairs == "sequential":
-        pairing = pycolmap.SequentialPairingOptions(overlap=job["overlap"])
-        pycolmap.match_sequential(database, pairing_options=pairing, **options)
-    else:
-        listed = root / "pairs.txt"
-        listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
-        pairing = pycolmap.ImportedPairingOptions(match_list_path=str(listed))
-        pycolmap.match_image_pairs(database, pairing_options=pairing, **options)
+    listed = root / "pairs.txt"
+    listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
+    pairing = pycolmap.ImportedPairingOptions(match_list_path=str(listed))
+    pycolmap.match_image_pairs(database, pairing_options=pairing, **options)
 
 
 def _pairs(job: dict[str, Any]) -> list[tuple[str, str]]:

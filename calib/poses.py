@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -22,7 +24,7 @@ LOOKED_AT = 6  # views on which the kinds of texture are judged
 APART = (0.2, 0.8)  # phases of the two instants that features are compared between: windows share no spike
 # A free focal length that is off by the first, and takes the second of the residual with it, says that K is wrong.
 WRONG_FOCAL = ((0.05, 0.02), (0.2, 0.003))
-HARDER = Options(peak_threshold=0.0015, max_ratio=0.85)
+HARDER = {"peak_threshold": 0.0015, "max_ratio": 0.85}
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +109,7 @@ def estimate_poses(
         rgb_camera: of the frames; None: the same as `camera`.
         spike_from_rgb: [3,4] for `both`; None: one centre, one direction.
         keep: folder for COLMAP's files of the best map.
-        done: called with the name of each step.
+        done: called with the name of each step, by several threads.
 
     Returns:
         The estimate; look at `reasons` before using it.
@@ -132,40 +134,36 @@ def estimate_poses(
     done("textures ranked")
     kinds = wanted.kinds or tuple(look.kind for look in ranked)
     rigged = _Rigged(usable, camera, wanted, options, rgb_camera or camera, spike_from_rgb, keep, done, gain)
-    maps: dict[str, Map] = {}
-    for kind in kinds[: wanted.maps]:
-        maps[kind] = rigged.map(kind, first=not maps)
+    maps = _side_by_side(rigged, kinds[: wanted.maps])
     enough = wanted.min_share * len(usable)
     spare = [k for k in kinds[wanted.maps :] if k not in maps]
     while max(len(m.poses) for m in maps.values()) < enough and spare:
         kind = spare.pop(0)
         maps[kind] = rigged.map(kind)
     if max(len(m.poses) for m in maps.values()) < enough:
-        harder = replace(HARDER, seed=options.seed, threads=options.threads, max_error_px=options.max_error_px)
-        rigged.options = harder
-        maps[f"{kinds[0]}, low contrast"] = rigged.map(kinds[0])
+        harder = replace(options, **HARDER)
+        maps[f"{kinds[0]}, low contrast"] = replace(rigged, options=harder).map(kinds[0])
     return _judged(_settled(rigged, maps, names, ranked), wanted)
 
 
+@dataclass(frozen=True, slots=True)
 class _Rigged:
     """Maps of one scene by kind of texture, with what they share."""
 
-    def __init__(
-        self,
-        views: Sequence[View],
-        camera: Camera,
-        wanted: Wanted,
-        options: Options,
-        rgb_camera: Camera,
-        spike_from_rgb: Floats | None,
-        keep: Any,
-        done: Callable[[str], None],
-        gain: Floats | None,
-    ) -> None:
-        self.views, self.camera, self.wanted, self.options = views, camera, wanted, options
-        self.rgb_camera, self.spike_from_rgb, self.keep, self.done = rgb_camera, spike_from_rgb, keep, done
-        self.gain = gain
-        self.phases = np.linspace(0, 1, wanted.instants) if wanted.instants > 1 else np.array([0.5])
+    views: Sequence[View]
+    camera: Camera
+    wanted: Wanted
+    options: Options
+    rgb_camera: Camera
+    spike_from_rgb: Floats | None
+    keep: Any
+    done: Callable[[str], None]
+    gain: Floats | None
+
+    @property
+    def phases(self) -> Floats:
+        """Of the exposure, at which poses are asked for."""
+        return np.linspace(0, 1, self.wanted.instants) if self.wanted.instants > 1 else np.array([0.5])
 
     def map(self, kind: str, first: bool = False) -> Map:
         """Map the middle instants by one kind of texture; the first map also takes the further instants."""
@@ -194,6 +192,16 @@ class _Rigged:
             done=lambda name: self.done(step + name),
         )
         return found if not folder else _arm(found, folder)
+
+
+def _side_by_side(rigged: _Rigged, kinds: Sequence[str]) -> dict[str, Map]:
+    """A map by each kind, each in a COLMAP of its own: much of COLMAP runs on one thread, so two run on two cores."""
+    threads = rigged.options.threads or len(os.sched_getaffinity(0))
+    at_once = max(1, min(threads, len(kinds)))
+    each = replace(rigged, options=replace(rigged.options, threads=max(1, threads // at_once)))
+    with ThreadPoolExecutor(at_once) as pool:
+        running = [pool.submit(each.map, kind, kind == kinds[0]) for kind in kinds]
+        return {kind: future.result() for kind, future in zip(kinds, running, strict=True)}
 
 
 def rig_config(spike: Camera, rgb: Camera, spike_from_rgb: Floats | None) -> list[dict[str, Any]]:
