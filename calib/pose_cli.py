@@ -90,6 +90,8 @@ def poses(
 def _scene(
     source: Path, out: Path | None, wanted: Any, options: Any, write: bool, write_to: Path | None, force: bool
 ) -> dict[str, Any]:
+    from dataclasses import asdict
+
     from spikerig.calib.posed_scene import write_poses
     from spikerig.calib.poses import estimate_poses
     from spikerig.dataset.store import open_scene
@@ -104,6 +106,7 @@ def _scene(
         simulated = scene.has_truth and "poses" not in scene.info
     told = report(estimate, options)
     told["source"] = str(source)
+    told["wanted"] = asdict(wanted)
     told["truth"] = against(estimate, known) if simulated else None
     told["forced"] = bool(estimate.reasons) and force
     if (write or write_to) and (told["accepted"] or force):
@@ -142,6 +145,8 @@ def report(estimate: Any, options: Any) -> dict[str, Any]:
     """An estimate, JSON-ready."""
     from dataclasses import asdict
 
+    from spikerig.dataset import machine
+
     best = estimate.best
     inliers = {n: p.inliers for n, p in best.poses.items()}
     return {
@@ -171,7 +176,7 @@ def report(estimate: Any, options: Any) -> dict[str, Any]:
         "observations": dict(sorted(inliers.items())),
         "poses": {n: p.tolist() for n, p in sorted(estimate.poses.items())},
         "options": asdict(options),
-        "versions": {"pycolmap": best.version},
+        "versions": machine.describe()["versions"] | {"pycolmap": best.version},
         "seconds": dict(estimate.seconds or best.seconds),
     }
 
