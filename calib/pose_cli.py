@@ -37,6 +37,8 @@ def poses(
     tries: Annotated[int, typer.Option(min=1, max=9, help="At mapping; the largest map is kept.")] = 2,
     pattern: Annotated[bool, typer.Option(help="Divide out the sensor's fixed pattern, as the views show it.")] = True,
     shared_camera: Annotated[bool, typer.Option(help="A folder's pictures are of one camera.")] = False,
+    board: Annotated[str, typer.Option(help="Inner corners of a board in view, e.g. 9x6: gives millimetres.")] = "",
+    square_mm: Annotated[float, typer.Option(help="Its squares.")] = 0.0,
     seed: Annotated[int, typer.Option(help="Of RANSAC and of the mapper.")] = 1,
     threads: Annotated[int, typer.Option(help="Of features and matches; 0: one a core.")] = 0,
     force: Annotated[bool, typer.Option("--force", help="Replace earlier results; keep refused ones.")] = False,
@@ -67,7 +69,8 @@ def poses(
             raise UsageError("give --write or --write-to, not both")
         listed = tuple(k for k in kinds.split(",") if k)
         wanted = Wanted(arms, listed, min(maps, len(listed)) if listed else maps, instants, min_share, off, pattern)
-        told = _scene(source, out, wanted, options, write, write_to, force)
+        sized = _board(board, square_mm)
+        told = _scene(source, out, wanted, options, write, write_to, force, sized)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         (out / "poses.json").write_text(json.dumps(told, indent=1), encoding="utf-8")
@@ -88,7 +91,14 @@ def poses(
 
 
 def _scene(
-    source: Path, out: Path | None, wanted: Any, options: Any, write: bool, write_to: Path | None, force: bool
+    source: Path,
+    out: Path | None,
+    wanted: Any,
+    options: Any,
+    write: bool,
+    write_to: Path | None,
+    force: bool,
+    board: Any,
 ) -> dict[str, Any]:
     from dataclasses import asdict
 
@@ -103,17 +113,44 @@ def _scene(
         keep = None if out is None else out / "colmap"
         estimate = estimate_poses(views, scene.camera, wanted, options, keep=keep, done=lambda step: bar.step(1, step))
         known = {v.name: v.pose.cam_from_world for v in views}
+        size = _size(views, estimate, scene.camera, board)
         simulated = scene.has_truth and "poses" not in scene.info
     told = report(estimate, options)
     told["source"] = str(source)
     told["wanted"] = asdict(wanted)
+    told["board"] = size
     told["truth"] = against(estimate, known) if simulated else None
     told["forced"] = bool(estimate.reasons) and force
     if (write or write_to) and (told["accepted"] or force):
         left_out = ("poses", "source", "seconds")
         record = {k: v for k, v in told.items() if k not in left_out}
+        if size and size["mm_per_unit"]:
+            note(f"a unit of the estimate's own world is {size['mm_per_unit']:.2f} mm +- {size['sd']:.2f}")
         told |= write_poses(source, estimate, record, out=write_to, force=force)
     return told
+
+
+def _board(pattern: str, square_mm: float) -> Any:
+    from spikerig.calib.boards import board_of
+
+    if bool(pattern) != (square_mm > 0):
+        raise UsageError("a board needs --board and --square-mm", value=(pattern, square_mm))
+    return board_of(pattern, square_mm) if pattern else None
+
+
+def _size(views: Any, estimate: Any, camera: Any, board: Any) -> dict[str, Any] | None:
+    """Millimetres a unit of the estimate's world, or why not; None where no board was named."""
+    from dataclasses import asdict
+
+    from spikerig.calib.boards import find
+    from spikerig.calib.poses import texture_at
+    from spikerig.calib.scale import Scale, scale_of
+
+    if board is None:
+        return None
+    seen = {v.name: find(texture_at(v, 0.5, "tfp128").light, board) for v in views if v.name in estimate.poses}
+    found = scale_of(estimate.poses, {n: f for n, f in seen.items() if f is not None}, camera, board)
+    return asdict(found) if isinstance(found, Scale) else {"mm_per_unit": None, "reason": found}
 
 
 def _folder(source: Path, out: Path | None, options: Any, shared: bool, min_share: float) -> dict[str, Any]:

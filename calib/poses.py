@@ -18,6 +18,7 @@ from spikerig.calib.pattern import fixed_pattern
 from spikerig.calib.pictures import KINDS, Looks, frame_picture, looks, picture_of, texture_of
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.scene import Camera, View
+from spikerig.dataset.texture import Texture
 
 Floats = NDArray[np.float64]
 LOOKED_AT = 6  # views on which the kinds of texture are judged
@@ -254,10 +255,15 @@ def look_at(view: View, phase: float, kind: str, gain: Floats | None = None) -> 
     if kind[:3] == "tfp" and kind[3:].isdigit() and int(kind[3:]) > view.spikes.ticks:
         told = f"{view.name}, {kind}: {view.spikes.ticks} ticks"
         raise UsageError("a texture does not fit the spikes", value=told, next="ask for a shorter window")
+    return picture_of(texture_at(view, phase, kind, gain))
+
+
+def texture_at(view: View, phase: float, kind: str, gain: Floats | None = None) -> Texture:
+    """The texture of a view by a kind, at a phase of the exposure; light is divided by the gain."""
+    if view.spikes is None:
+        raise UsageError("this view has no spikes", value=view.name)
     texture = texture_of(view.spikes, tick_at(view, phase), kind)
-    if gain is not None:
-        texture = replace(texture, light=(texture.light / gain).astype(np.float32))
-    return picture_of(texture)
+    return texture if gain is None else replace(texture, light=(texture.light / gain).astype(np.float32))
 
 
 def tick_at(view: View, phase: float) -> float:

@@ -1,0 +1,55 @@
+"""The size of a map from a board that some views see."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from calib_worlds import ring
+
+from spikerig.calib.boards import Board, Found
+from spikerig.calib.scale import Scale, scale_of
+from spikerig.dataset.scene import Camera
+
+BOARD = Board(9, 6, 24.0)
+CAMERA = dataclasses.replace(Camera.pinhole(400, 250, 60), distortion=np.array([0.05, -0.02, 0.001, 0.0]))
+MM = 137.0  # a unit of the map
+
+
+def look(pose: np.ndarray, at: np.ndarray, noise: float, turned: bool, seed: int) -> Found:
+    """The board lying at a place of the map, as a view sees it; its corners may come in the other order."""
+    import cv2
+
+    world = at + BOARD.points() / MM
+    K = np.asarray(CAMERA.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], np.float64)
+    px = cv2.projectPoints(world, pose[:, :3], pose[:, 3], K, CAMERA.distortion)[0].reshape(-1, 2) + 0.5
+    px += noise * np.random.default_rng(seed).normal(size=px.shape)
+    return Found(px[::-1] if turned else px, np.ones(len(px), bool), "sb")
+
+
+def views(noise: float, count: int = 7) -> tuple[dict[str, np.ndarray], dict[str, Found]]:
+    poses = {f"{k:03d}": p for k, p in enumerate(ring(count))}
+    at = np.array([0.05, -0.04, 0.0])
+    return poses, {n: look(p, at, noise, k % 2 == 1, k) for k, (n, p) in enumerate(poses.items())}
+
+
+@pytest.mark.parametrize(("noise", "within"), [(0.0, 1e-4), (0.15, 0.02)])
+def test_millimetres_are_found_whatever_the_labels(noise: float, within: float) -> None:
+    poses, seen = views(noise)
+    seen["other"] = seen["000"]  # a view without a pose
+    found = scale_of(poses, seen, CAMERA, BOARD)
+    assert isinstance(found, Scale)
+    assert found.mm_per_unit == pytest.approx(MM, rel=within)
+    assert len(found.views) == 7
+    if noise:
+        assert abs(found.mm_per_unit - MM) < 4 * found.sd + 0.005 * MM
+
+
+def test_why_there_is_none() -> None:
+    poses, seen = views(0.0)
+    assert "2 of 7" in str(scale_of(poses, {n: seen[n] for n in ("000", "003")}, CAMERA, BOARD))
+    same = dict.fromkeys(poses, poses["002"])
+    assert "one direction" in str(scale_of(same, dict.fromkeys(poses, seen["002"]), CAMERA, BOARD))
+    far = {n: look(p, np.array([0.05, -0.04, 0.25 * k]), 0.0, False, 0) for k, (n, p) in enumerate(poses.items())}
+    assert "do not meet" in str(scale_of(poses, far, CAMERA, BOARD))
+    sizes = {n: dataclasses.replace(f, px=100 + (1 + 0.3 * k) * (f.px - 100)) for k, (n, f) in enumerate(seen.items())}
+    assert not isinstance(scale_of(poses, sizes, CAMERA, BOARD), Scale)
