@@ -74,9 +74,8 @@ def middle_of(found: Found, camera: Camera, board: Board) -> Floats | None:
 
     if found.seen.sum() < 6:
         return None
-    K = np.asarray(camera.K, np.float64) - np.array(
-        [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-    )  # OpenCV's pixel centres are at 0
+    K = np.array(camera.K, np.float64)
+    K[:2, 2] -= 0.5  # OpenCV's pixel centres are at 0
     distortion = np.asarray(camera.distortion, np.float64)
     here, px = board.points()[found.seen], found.px[found.seen] - 0.5
     ok, _, t = cv2.solvePnP(here, px, K, distortion, flags=cv2.SOLVEPNP_IPPE)
