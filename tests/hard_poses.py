@@ -40,7 +40,7 @@ ROWS = [
     (
         "a sensor without a fixed pattern, a dead pixel, fewer than eight views",
         "fixed_pattern",
-        "none invented (sd under 0.8 %); within 25 %; None",
+        "none invented (sd under 0.2 %); within 25 %; None",
         "calib/test_pattern.py::test_none_is_invented",
     ),
     (

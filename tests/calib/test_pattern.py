@@ -40,7 +40,7 @@ def test_a_pattern_is_found() -> None:
 def test_none_is_invented() -> None:
     found = fixed_pattern(views(np.ones(SIZE), 24))
     assert found is not None
-    assert np.std(np.log(found)) < 0.008
+    assert np.std(np.log(found)) < 0.002
 
 
 def test_a_wild_pixel_is_bounded_and_the_dark_is_finite() -> None:

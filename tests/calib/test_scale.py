@@ -1,14 +1,20 @@
 """The size of a map from a board that some views see."""
 
 import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from calib_worlds import ring
 
+from spikerig.calib import pose_cli
 from spikerig.calib.boards import Board, Found
 from spikerig.calib.scale import Scale, scale_of
-from spikerig.dataset.scene import Camera
+from spikerig.dataset import cli
+from spikerig.dataset.scene import Camera, View
+from spikerig.dataset.texture import Texture
 
 BOARD = Board(9, 6, 24.0)
 CAMERA = dataclasses.replace(Camera.pinhole(400, 250, 60), distortion=np.array([0.05, -0.02, 0.001, 0.0]))
@@ -22,7 +28,7 @@ def look(pose: np.ndarray, at: np.ndarray, noise: float, turned: bool, seed: int
     world = at + BOARD.points() / MM
     K = np.asarray(CAMERA.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], np.float64)
     px = cv2.projectPoints(world, pose[:, :3], pose[:, 3], K, CAMERA.distortion)[0].reshape(-1, 2) + 0.5
-    px += noise * np.random.default_rng(seed).normal(size=px.shape)
+    px = np.asarray(px + noise * np.random.default_rng(seed).normal(size=px.shape), np.float64)
     return Found(px[::-1] if turned else px, np.ones(len(px), bool), "sb")
 
 
@@ -53,3 +59,32 @@ def test_why_there_is_none() -> None:
     assert "do not meet" in str(scale_of(poses, far, CAMERA, BOARD))
     sizes = {n: dataclasses.replace(f, px=100 + (1 + 0.3 * k) * (f.px - 100)) for k, (n, f) in enumerate(seen.items())}
     assert not isinstance(scale_of(poses, sizes, CAMERA, BOARD), Scale)
+
+
+def test_a_board_needs_its_size(tmp_path: Path) -> None:
+    (tmp_path / "scene.h5").write_bytes(b"")
+    for words in (["--board", "9x6"], ["--square-mm", "24"]):
+        assert cli.run(["calib", "poses", str(tmp_path / "scene.h5"), *words]) == 2
+
+
+def test_boards_are_looked_for_on_the_placed_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command's way: textures of placed views, boards on them, a scale or a reason for the report."""
+    poses, seen = views(0.0)
+    asked: list[str] = []
+    names = {id(f): n for n, f in seen.items()}
+
+    def texture_at(view: View, phase: float, kind: str) -> Texture:
+        asked.append(view.name)
+        return Texture(np.full((2, 2), int(view.name), np.float32), np.ones((2, 2), bool), 0.0, kind)
+
+    monkeypatch.setattr("spikerig.calib.poses.texture_at", texture_at)
+    monkeypatch.setattr("spikerig.calib.boards.find", lambda light, board: seen.get(f"{int(light[0, 0]):03d}"))
+    shown: Any = [SimpleNamespace(name=n) for n in [*poses, "009"]]
+    told = pose_cli._size(shown, SimpleNamespace(poses=poses), CAMERA, BOARD)
+    assert told is not None
+    assert told["mm_per_unit"] == pytest.approx(MM, rel=1e-4)
+    assert asked == list(poses) == sorted(names.values())
+    del seen["000"], seen["001"], seen["002"], seen["003"], seen["004"]
+    told = pose_cli._size(shown, SimpleNamespace(poses=poses), CAMERA, BOARD)
+    assert told == {"mm_per_unit": None, "reason": told and told["reason"]}
+    assert pose_cli._size(shown, SimpleNamespace(poses=poses), CAMERA, None) is None
