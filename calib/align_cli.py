@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import json
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
 
-from spikerig.dataset.errors import DataError, UsageError
+from spikerig.dataset.errors import UsageError
 from spikerig.dataset.info_cli import Json
 from spikerig.dataset.terminal import Progress, emit, jsonable, note
 
 if TYPE_CHECKING:
     from spikerig.calib.agree import Agreement
-    from spikerig.calib.align import Aligned, Region, Warp
-    from spikerig.calib.aligned_scene import Checked
+    from spikerig.calib.align import Aligned, Warp
+    from spikerig.calib.aligned_scene import Checked, Wish
     from spikerig.calib.rig import RigCalibration
     from spikerig.calib.sheet import Row
     from spikerig.dataset.scene import View
@@ -35,6 +33,15 @@ def align(
     regions: Annotated[
         Path | None, typer.Option(help='JSON of what is not scene: [{"arm": "rgb", "polygon_px": [[x, y], ...]}].')
     ] = None,
+    panel_spike: Annotated[
+        list[str] | None, typer.Option(help="The clock's LED panel, x0,y0,x1,y1 in raw spike pixels; may be repeated.")
+    ] = None,
+    panel_rgb: Annotated[
+        list[str] | None, typer.Option(help="The same in raw RGB pixels: what one arm sees of it is enough.")
+    ] = None,
+    find_panel: Annotated[
+        bool, typer.Option("--find-panel", help="Find the panel by its blinking, in the spikes of each view.")
+    ] = False,
     sheet: Annotated[Path | None, typer.Option(help="A contact sheet to write (.html).")] = None,
     overlays: Annotated[Path | None, typer.Option(help="A folder for an overlay picture of each view.")] = None,
     check: Annotated[bool, typer.Option("--check", help="Only hold edges against edges; write no scene.")] = False,
@@ -48,16 +55,23 @@ def align(
     Spikes stay raw. The result is held edge against edge; where both arms do not agree it is refused (exit 4).
     """
     from spikerig.calib.aligned_scene import WORST_PX, Wish, check_alignment, write_aligned
-    from spikerig.calib.flat import read_flat
+    from spikerig.calib.plots import spot_of
+    from spikerig.calib.regions import check_regions, panel_of, read_regions, regions_json
     from spikerig.calib.rig import read_calibration
     from spikerig.calib.sheet import page
+    from spikerig.dataset.flat import read_flat
     from spikerig.dataset.outfile import refuse_existing, whole_file
+    from spikerig.dataset.provenance import origin_of
     from spikerig.dataset.store import open_scene
 
     record = read_calibration(calibration)
-    wish = Wish(
-        depth_mm, () if regions is None else _regions(regions), refine, None if flat is None else read_flat(flat)
+    given = (
+        *(() if regions is None else read_regions(regions)),
+        *(panel_of(text, "spike") for text in panel_spike or ()),
+        *(panel_of(text, "rgb") for text in panel_rgb or ()),
     )
+    check_regions(given, record)
+    wish = Wish(depth_mm, given, refine, None if flat is None else read_flat(flat), find_panel)
     for path in (sheet, None if check else out):
         if path is not None:
             refuse_existing(path, force)
@@ -67,16 +81,20 @@ def align(
         bar = Progress("aligning", len(scene.names), "views")
         pictures = _Pictures(overlays, record, sheet is not None)
         checked = check_alignment(scene, record, wish, lambda *told: (pictures.take(*told), bar.step())[0])
-        poses = [scene.view(name, spikes=False).pose for name in scene.names]
+        spots = [spot_of(scene.view(name, spikes=False)) for name in scene.names]
         name, worst = scene.name, checked.median_px
+        origin = origin_of(
+            scene, "opencv-contrib-python-headless", "h5py", files={"calibration": calibration, "flat": flat}
+        )
     accepted = bool(worst <= WORST_PX)
-    told = _report(source, record, checked, accepted, force, refine)
+    told = _report(source, record, checked, accepted, force, refine) | {"versions": origin["versions"]}
+    told |= {"regions": regions_json(given), "panels": None if not find_panel else {
+        name: regions_json(found) for name, found in checked.panels.items()}}  # fmt: skip
     if sheet is not None:
         with whole_file(sheet, force=force) as part:
-            part.write_text(page(name, record, pictures.rows, poses), encoding="utf-8")
+            part.write_text(page(name, record, pictures.rows, spots), encoding="utf-8")
     if (accepted or force) and not check:
-        provenance = {k: told[k] for k in ("calibration", "edges_px", "refinement", "accepted", "forced", "versions")}
-        provenance |= {"depth_mm": depth_mm, "regions": len(wish.regions), "flat": None if flat is None else flat.name}
+        provenance = _provenance(told, origin, wish, record, depth_mm)
         told |= write_aligned(source, record, checked, jsonable(provenance), out=out, force=force)
     if as_json:
         emit("spikerig.calib.align/1", told)
@@ -105,23 +123,6 @@ class _Pictures:
             self.rows.append(row_of(view.name, aligned, agreement, sharp_textures(view, self.record, warp)))
 
 
-def _regions(path: Path) -> tuple[Region, ...]:
-    from spikerig.calib.align import Region
-
-    try:
-        rows = json.loads(path.read_text(encoding="utf-8"))
-        return tuple(Region(_arm(row["arm"]), np.array(row["polygon_px"], np.float64)) for row in rows)
-    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-        raise DataError("the regions cannot be read", value=f"{path}: {error}",
-                        expected='[{"arm": "rgb", "polygon_px": [[x, y], ...]}]') from error  # fmt: skip
-
-
-def _arm(name: str) -> Any:
-    if name not in ("spike", "rgb"):
-        raise ValueError(f"{name!r} is no arm")
-    return name
-
-
 def _report(
     source: Path, record: RigCalibration, checked: Checked, accepted: bool, force: bool, refine: bool
 ) -> dict[str, Any]:
@@ -139,12 +140,22 @@ def _report(
         "calibration": record.id,
         "model": record.model,
         "edges_px": {"median": checked.median_px, "views": edges},
-        "valid": float(checked.warp.valid.mean()),
+        "valid": float(np.mean([checked.warp_of(name).valid.mean() for name in checked.agreement] or [0.0])),
         "refinement": checked.refinement if refine else None,
         "spikes_lie_on_the_camera": checked.warp.same,
-        "versions": {"spikerig": version("spikerig"), "numpy": np.__version__},
         "written": None,
     }
+
+
+def _provenance(
+    told: dict[str, Any], origin: dict[str, Any], wish: Wish, record: RigCalibration, depth_mm: float | None
+) -> dict[str, Any]:
+    """What the aligned scene keeps of how it was made, as info.align."""
+    kept = ("calibration", "model", "edges_px", "valid", "refinement", "accepted", "reasons", "forced")
+    options = {"depth_mm": depth_mm, "refine": wish.refine, "flat": wish.flat is not None}
+    residuals = {"board_px": record.residual_px, "crop_px": record.sd.get("crop_px")}
+    parts = {k: told[k] for k in (*kept, "regions", "panels")}
+    return parts | origin | {"options": options, "residuals": residuals}
 
 
 def _say(told: dict[str, Any], checked: Checked, record: RigCalibration) -> None:
@@ -152,6 +163,9 @@ def _say(told: dict[str, Any], checked: Checked, record: RigCalibration) -> None
     note(
         f"{n} views, {100 * told['valid']:.1f} % of the pixels seen by both arms, edges {checked.median_px:.3f} px off"
     )
+    if told["panels"] is not None:
+        n = sum(bool(found) for found in told["panels"].values())
+        note(f"a blinking panel was found in {n} views, and is not valid there")
     if record.model == "stereo":
         note("note: a stereo rig is aligned at one depth only; elsewhere edges lie apart")
     if not checked.warp.same:

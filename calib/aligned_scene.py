@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,17 +17,19 @@ from spikerig.calib.align import (
     Warp,
     coded_like,
     linear_of,
-    own_rows,
     pair,
     rows_of_spike_px,
     warp_light,
     warp_of,
+    without,
 )
 from spikerig.calib.crop import grid
-from spikerig.calib.flat import FlatField, flattened
+from spikerig.calib.regions import blinking_regions
 from spikerig.calib.rig import RigCalibration, as_json
 from spikerig.calib.rolling import exposure_texture
 from spikerig.dataset.errors import RefusedError, UsageError
+from spikerig.dataset.flat import FlatField, flattened
+from spikerig.dataset.outfile import refuse_existing, stand_in
 from spikerig.dataset.scene import Truth, View
 from spikerig.dataset.store import SceneFile, open_scene
 from spikerig.dataset.texture import Texture
@@ -40,21 +41,28 @@ WORST_PX = 0.5  # median over views of how far edges lie apart, above which an a
 @dataclass(frozen=True, slots=True)
 class Wish:
     """How to align: depth and regions as in `warp_of`; `refine` takes a small common error out by ECC; `flat` evens
-    the sensor out before edges are compared."""
+    the sensor out before edges are compared; `find_panel` leaves blinking lamps out, view by view."""
 
     depth_mm: float | None = None
     regions: tuple[Region, ...] = ()
     refine: bool = False
     flat: FlatField | None = None
+    find_panel: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """A planned alignment: the warp, how well each view's edges agree, the refinement taken (None: none)."""
+    """A planned alignment: the warp, how well each view's edges agree, the refinement taken (None: none), and the
+    regions of each view that blink."""
 
     warp: Warp
     agreement: dict[str, Agreement]
     refinement: Floats | None
+    panels: dict[str, tuple[Region, ...]]
+
+    def warp_of(self, name: str) -> Warp:
+        """The warp of one view, its blinking regions left out."""
+        return without(self.warp, self.panels.get(name, ()))
 
     @property
     def median_px(self) -> float:
@@ -86,14 +94,18 @@ def check_alignment(
     if wish.refine:
         refinement = _refinement(scene, calibration, warp, wish)
         warp = warp_of(calibration, depth_mm=wish.depth_mm, regions=wish.regions, refinement=refinement)
-    found: dict[str, Agreement] = {}
+    checked = Checked(warp, {}, refinement, {})
     for name in scene.names:
         view = scene.view(name)
         if view.spikes is not None:
-            told = pair(view, calibration, warp=warp, texture=_texture(view, calibration, wish))
-            found[name] = edge_agreement(told.texture.light, told.light.mean(2), told.valid & told.texture.known)
-            done(view, told, warp, found[name])
-    return Checked(warp, found, refinement)
+            if wish.find_panel:
+                checked.panels[name] = blinking_regions(view.spikes)
+            own = checked.warp_of(name)
+            told = pair(view, calibration, warp=own, texture=_texture(view, calibration, wish))
+            agreement = edge_agreement(told.texture.light, told.light.mean(2), told.valid & told.texture.known)
+            checked.agreement[name] = agreement
+            done(view, told, own, agreement)
+    return checked
 
 
 def _texture(view: View, calibration: RigCalibration, wish: Wish) -> Texture:
@@ -155,26 +167,22 @@ def write_aligned(
     from spikerig.dataset.store import SceneWriter
 
     target = out or path
-    if out is not None and out.exists() and not force:
-        raise UsageError("the file exists already", value=out, next="give --force to replace it")
-    beside = target.with_name(f".{target.stem}.align.{os.getpid()}{target.suffix}")
-    with open_scene(path) as scene:
+    if out is not None:
+        refuse_existing(out, force)
+    with open_scene(path) as scene, stand_in(target, "align") as beside:
         same = same_camera(scene, checked.warp)
         truth = scene.truth
         if truth is not None and not same:
             truth = replace(truth, light={})
-        try:
-            with SceneWriter(
-                beside, scene.name, checked.warp.camera, light_gain=calibration.split_ratio or scene.light_gain,
-                info={**scene.info, "align": provenance}, points=scene.points, clock=scene.clock,
-                calibration={**as_json(calibration), "id": calibration.id}, truth=truth, keep=False,
-            ) as writer:  # fmt: skip
-                for name in scene.names:
-                    writer.add(_aligned_view(scene.view(name), checked.warp), **_truth(scene, name, truth, same))
-                    done()
-            os.replace(beside, target)
-        finally:
-            beside.unlink(missing_ok=True)
+        with SceneWriter(
+            beside, scene.name, checked.warp.camera, light_gain=calibration.split_ratio or scene.light_gain,
+            info={**scene.info, "align": provenance}, points=scene.points, clock=scene.clock,
+            calibration={**as_json(calibration), "id": calibration.id}, truth=truth, keep=False,
+        ) as writer:  # fmt: skip
+            for name in scene.names:
+                warp = checked.warp_of(name)
+                writer.add(_aligned_view(scene.view(name), warp), **_truth(scene, name, truth, same))
+                done()
     return {"written": str(target), "true_light_kept": bool(same and scene.has_truth)}
 
 
@@ -188,10 +196,8 @@ def same_camera(scene: SceneFile, warp: Warp) -> bool:
 
 def _aligned_view(view: View, warp: Warp) -> View:
     light = np.where(warp.valid[..., None], warp_light(warp, linear_of(view.frame)), 0)
-    nothing = Texture(np.zeros(warp.valid.shape, np.float32), np.zeros(warp.valid.shape, bool), 0.0, "none")
     frame = replace(view.frame, pixels=coded_like(view.frame, light))
-    told = Aligned(warp.camera, light, nothing, warp.sensor_row, warp.valid, frame)
-    frame, rows = own_rows(told, view.frame.pixels.shape[0])
+    rows = np.where(warp.valid, warp.sensor_row, 0)
     return replace(view, frame=frame, sensor_row=rows, valid=warp.valid)
 
 

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.calib.saddle import refine
+from spikerig.calib.saddle import REACH, refine
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.images import srgb_from_linear
 
 Floats = NDArray[np.float64]
 SMALL = 800  # pictures narrower than this are doubled before boards are sought: small squares are found then
+CLEAR = 1.0  # of the way to the corner of the nearest marker
+SMALLEST = 32  # px a side that a picture of a board has at least
 LARGEST = 60  # corners a side
 
 
@@ -47,6 +49,12 @@ class Board:
         if self.charuco:
             return (0,)
         return (0, 1, 2, 3) if self.cols == self.rows else (0, 2)
+
+    @property
+    def free(self) -> float:
+        """How far around a corner nothing but its two edges is to be seen, in squares: markers begin there."""
+        bare = 1 - self.marker_mm / self.square_mm if self.charuco else 1.0
+        return min(REACH, CLEAR * bare / 2**0.5)
 
     def relabelled(self, corners: NDArray[Any], turns: int, mirrored: bool = False) -> NDArray[Any]:
         """Corners [N,...] with the labels of a board turned by quarter turns (or first seen in a mirror)."""
@@ -90,7 +98,7 @@ def board_of(pattern: str, square_mm: float, charuco: str = "", marker_mm: float
     match = re.fullmatch(r"(\d{1,3})[xX×](\d{1,3})", pattern.strip())
     if not match or not all(3 <= int(n) <= LARGEST for n in match.groups()):
         raise UsageError("a pattern is COLSxROWS inner corners", value=pattern, expected="e.g. 9x6, at least 3x3")
-    if not (np.isfinite(square_mm) and 0 < square_mm <= 1e5):
+    if not (np.isfinite(square_mm) and 1e-3 <= square_mm <= 1e5):
         raise UsageError("the edge of a square is a positive length in mm", value=square_mm, expected="e.g. 24")
     if charuco:
         marker_mm = marker_mm or 0.75 * square_mm
@@ -133,7 +141,7 @@ def find(light: NDArray[Any], board: Board) -> Found | None:
     found = _find_charuco(gray, board) if board.charuco else _find_plain(gray, board)
     if found is None:
         return None
-    return replace(found, px=refine(light, found.px, found.seen, board.cols, board.rows))
+    return replace(found, px=refine(light, found.px, found.seen, board.cols, board.rows, board.free))
 
 
 def _find_plain(gray: NDArray[np.uint8], board: Board) -> Found | None:
@@ -179,26 +187,40 @@ def _dictionary(name: str) -> Any:
 
 
 def _find_charuco(gray: NDArray[np.uint8], board: Board) -> Found | None:
-    """Markers do not read in a mirror: the picture is tried both ways, and the better one says how it was seen."""
+    """Markers do not read in a mirror: the picture is tried both ways, and the better one says how it was seen.
+
+    Boards with an even number of rows of squares are sought with OpenCV's old pattern too (before 4.6), if need be.
+    """
+    import cv2
+
+    scale = 2 if gray.shape[1] < SMALL else 1
+    large = gray if scale == 1 else cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    for old in (False, True) if board.rows % 2 else (False,):
+        found = _find_pattern(large, board, old)
+        if found is not None:
+            return replace(found, px=found.px / scale)
+    return None
+
+
+def _find_pattern(gray: NDArray[np.uint8], board: Board, old: bool) -> Found | None:
     import cv2
 
     made = cv2.aruco.CharucoBoard(
         (board.cols + 1, board.rows + 1), board.square_mm, board.marker_mm, _dictionary(board.charuco)
     )
+    made.setLegacyPattern(old)
     # Where the library has its corners, in squares: its origin and direction have changed between versions.
     at = np.asarray(made.getChessboardCorners(), np.float64)[:, :2] / board.square_mm
     cell = np.rint(at - at.min(0)).astype(int)
     label = cell[:, 1] * board.cols + cell[:, 0]
     detector = cv2.aruco.CharucoDetector(made)
-    scale = 2 if gray.shape[1] < SMALL else 1
-    large = gray if scale == 1 else cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
     best: Found | None = None
     for mirrored in (False, True):
-        corners, ids, _, _ = detector.detectBoard(np.ascontiguousarray(large[:, ::-1]) if mirrored else large)
+        corners, ids, _, _ = detector.detectBoard(np.ascontiguousarray(gray[:, ::-1]) if mirrored else gray)
         if ids is None or len(ids) < 6 or (best is not None and len(ids) <= best.seen.sum()):
             continue
         px = np.full((len(label), 2), np.nan)
-        px[label[np.asarray(ids).ravel()]] = ours(corners) / scale
+        px[label[np.asarray(ids).ravel()]] = ours(corners)
         if mirrored:
             px[:, 0] = gray.shape[1] - px[:, 0]
         best = Found(px, np.isfinite(px[:, 0]), "charuco", mirrored)

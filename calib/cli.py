@@ -35,6 +35,9 @@ def board(
     window: Annotated[int, typer.Option(help="Spike files: ticks of a short texture.")] = 128,
     windows: Annotated[int, typer.Option(help="Short textures averaged at most, while the picture is still.")] = 8,
     overlays: Annotated[Path | None, typer.Option(help="A folder for an overlay picture of each view.")] = None,
+    sheet: Annotated[
+        Path | None, typer.Option(help="A page of coverage, tilts and stability to write (.html), or (.svg).")
+    ] = None,
     height: Height = None,
     width: Width = None,
     row_bits: RowBits = None,
@@ -52,7 +55,7 @@ def board(
     from spikerig.calib.lens import LENSES
     from spikerig.calib.measure import look, measure, report
     from spikerig.calib.rig import write_calibration
-    from spikerig.calib.shots import Reading, pair_up
+    from spikerig.calib.shots import Reading, pair_up, unpaired
     from spikerig.dataset.outfile import refuse_existing
 
     made = board_of(pattern, square_mm, charuco, marker_mm)
@@ -62,7 +65,13 @@ def board(
     if window < 8 or windows < 1:
         raise UsageError("a short texture has at least 8 ticks, and there is at least one", value=(window, windows))
     refuse_existing(out, force)
+    _folders(out.parent, sheet and sheet.parent, made=overlays)
+    if sheet is not None:
+        refuse_existing(sheet, force)
+        if sheet.suffix.lower() not in (".html", ".svg"):
+            raise UsageError("a sheet is written as .html or .svg", value=sheet)
     pairs, how = pair_up(spike_dir, rgb_dir)
+    alone = unpaired(pairs, spike_dir, rgb_dir)
     if how != "stem":
         note(f"files are paired by {how}: {pairs[0].spike.name} with {pairs[0].rgb.name}, ...")
     bar = Progress("finding boards", len(pairs), "views")
@@ -70,7 +79,9 @@ def board(
     seen, in_mirror = look(pairs, made, reading, reading, bar.step)
     lenses = LENSES if lens == "auto" else (int(lens),)
     told = measure(made, seen, in_mirror, mirror=mirror, model=model, lenses=lenses)  # type: ignore[arg-type]
-    document = {"out": None, "paired_by": how, **report(told, forced=force)}
+    document = {"out": None, "paired_by": how, "unpaired": alone, **report(told, forced=force)}
+    if alone:
+        document["warnings"] = [f"without a partner, and left out: {', '.join(alone[:8])}", *document["warnings"]]
     keep = told.fit is not None and (told.verdict.accepted or force)
     if told.fit is not None and keep:
         record = replace(told.fit.calibration, forced=tuple(document["reason_codes"]))
@@ -81,11 +92,24 @@ def board(
 
         depths = [row.get("depth_mm") for row in document["views"]]
         shot_overlays(overlays, pairs, reading, told.fit.calibration, depths)
+    if sheet is not None:
+        from spikerig.calib.board_sheet import write_sheet
+
+        write_sheet(sheet, told, document, force=force)
     if as_json:
         emit("spikerig.calib.board/1", document)
     _say(told, document, out if keep else None)
     if not told.verdict.accepted and not keep:
         raise typer.Exit(4)
+
+
+def _folders(*needed: Path | None, made: Path | None = None) -> None:
+    """Folders to write into, looked at before the work begins: there already, or free to be made."""
+    for folder in needed:
+        if folder is not None and not folder.is_dir():
+            raise UsageError("there is no such folder", value=folder, next=f"mkdir -p {folder}")
+    if made is not None and made.exists() and not made.is_dir():
+        raise UsageError("the overlays go to a folder, and this is a file", value=made)
 
 
 def _one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
@@ -138,9 +162,9 @@ def photometric(
 ) -> None:
     """Calibrate the sensors' light: flat field, dark rate, vignetting, response, the splitter's ratio."""
     from spikerig.calib.even import measure_even
-    from spikerig.calib.flat import write_flat
     from spikerig.calib.rig import read_calibration, write_calibration
     from spikerig.calib.shots import Reading
+    from spikerig.dataset.flat import write_flat
     from spikerig.dataset.outfile import refuse_existing
 
     if out.suffix.lower() != ".npz":

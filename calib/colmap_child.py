@@ -210,7 +210,7 @@ def _model(model: Any, root: Path) -> dict[str, Any]:
         if image.has_pose:
             seen = sum(1 for p in image.points2D if p.has_point3D())
             pose = np.asarray(image.cam_from_world().matrix())
-            images[image.name] = {"pose": pose.tolist(), "points": seen}
+            images[image.name] = {"pose": pose.tolist(), "points": seen, "error_px": _residual(model, image)}
     points = list(model.points3D.values())
     np.save(root / "xyz.npy", np.array([p.xyz for p in points], np.float64).reshape(-1, 3))
     np.save(root / "rgb.npy", np.array([p.color for p in points], np.uint8).reshape(-1, 3))
@@ -229,6 +229,17 @@ def _model(model: Any, root: Path) -> dict[str, Any]:
         "track_length": float(model.compute_mean_track_length()),
         "cameras": cameras,
     }
+
+
+def _residual(model: Any, image: Any) -> float | None:
+    """Mean distance in pixels of an image's features from the points they are of; None where it has none."""
+    off = []
+    for feature in image.points2D:
+        if feature.has_point3D():
+            at = image.project_point(model.points3D[feature.point3D_id].xyz)
+            if at is not None:
+                off.append(float(np.linalg.norm(np.asarray(at) - feature.xy)))
+    return float(np.mean(off)) if off else None
 
 
 def _focal(sparse: Path) -> dict[str, float]:

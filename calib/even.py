@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from spikerig.calib.flat import FlatField
 from spikerig.calib.photometric import Level, count_level, flat_field, smooth_part
 from spikerig.calib.response import Response, fit_response, rgb_mean
 from spikerig.calib.shots import Reading, files_in, open_reading, pair_up
 from spikerig.dataset.errors import UsageError
+from spikerig.dataset.flat import FlatField
 from spikerig.dataset.images import SUFFIXES, linear_from_srgb, read_image
 
 CURVE = 0.03  # a curve whose slope is off 1 by more than this is not sRGB

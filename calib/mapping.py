@@ -65,11 +65,13 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """A picture placed in a map: cam_from_world float64[3,4], its inliers, covariance of rotation and translation."""
+    """A picture placed in a map: cam_from_world float64[3,4], its inliers, covariance of rotation and translation, and
+    the mean residual of its features in pixels."""
 
     pose: NDArray[np.float64]
     inliers: int
     cov: NDArray[np.float64] | None = None
+    error_px: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,7 +229,7 @@ def _keep(root: Path, keep: Path) -> None:
 def _map_of(told: dict[str, Any], root: Path, names: Mapping[str, str]) -> Map:
     if not told.get("images"):
         return Map(models=tuple(told["models"]), seconds=told["seconds"], version=told["version"])
-    poses = {names[n]: Placed(np.array(r["pose"]), r["points"]) for n, r in told["images"].items()}
+    poses = {names[n]: Placed(np.array(r["pose"]), r["points"], None, r["error_px"]) for n, r in told["images"].items()}
     placed = {
         names[n]: Placed(np.array(r["pose"]), r["inliers"], np.array(r["cov"]))
         for n, r in told.get("placed", {}).items()

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.calib.boards import Board, Found, find, seen_size
+from spikerig.calib.boards import SMALLEST, Board, Found, find, seen_size
 from spikerig.calib.bundle import Sight
 from spikerig.calib.crop import crop_homography, working_depth_mm
 from spikerig.calib.lens import LENSES
@@ -19,14 +19,17 @@ from spikerig.calib.shots import Pair, Reading, content_hash, read_light
 from spikerig.calib.verdict import Seen, Verdict, coverage, judge_fit, judge_views, pair_rms_px, tilt_deg
 from spikerig.dataset.errors import DataError, NumericsError, RigError
 
-PROBES = 4  # pictures of an arm in which any checkerboard is sought: two, and two in which the one given is not seen
 PROBES = 4  # pictures of an arm in which any checkerboard is sought: two, and others in which the one given is not seen
 ModelHint = Literal["auto", "common", "stereo"]
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What came of it: the verdict, the fit (None where none was possible), what each view showed."""
+    """What came of it: the verdict, the fit (None where none was possible), what each view showed.
+
+    `mirror` says how it is known whether the arms' parities differ, and which arm is the mirrored one: "measured" (both
+    were tried), "markers", "given", or "convention" (nothing in the pictures could tell).
+    """
 
     board: Board
     seen: Seen
@@ -34,6 +37,7 @@ class Measured:
     verdict: Verdict
     fit: RigFit | None
     mirrored_board: tuple[bool | None, bool | None]
+    mirror: dict[str, str]
 
 
 def look(
@@ -59,6 +63,10 @@ def look(
                 light = read_light(path, reading)
             except RigError as error:
                 broken.append(f"{path}: {error.what}" + ("" if error.value is None else f" ({error.value})"))
+                continue
+            if min(light.shape) < SMALLEST:
+                height, width = light.shape
+                broken.append(f"{path}: {width}x{height} pixels are too few to show a board")
                 continue
             hopeless = len(sizes) >= PROBES and not any(f is not None for arm_found in found for f in arm_found)
             here = None if hopeless else find(light, board)  # another board: every further search would be in vain
@@ -101,26 +109,40 @@ def measure(
     """Fit and judge what was seen; `mirrored_board` as `look` returns it, the rest as in `fit_rig`."""
     verdict = Verdict()
     used = judge_views(board, seen, verdict)
+    known = {"parity": "measured", "arm": "convention"} if mirror == "auto" else {"parity": "given", "arm": "given"}
     if mirror == "auto" and None not in mirrored_board:
+        known = {"parity": "markers", "arm": "markers"}
         if all(mirrored_board):
-            verdict.warnings.append("both arms see the board in a mirror: taken as neither")
+            verdict.warnings.append(
+                "both arms see the board in a mirror: taken as neither, so that the world is mirrored instead"
+            )
+            seen = replace(seen, spike=_in_a_mirror(board, seen.spike), rgb=_in_a_mirror(board, seen.rgb))
         mirror = _hint(mirrored_board)
-        if all(mirrored_board):
-            seen = replace(seen, spike=seen.spike.flipped(), rgb=seen.rgb.flipped())
     fit = None
     try:
         fit = fit_rig(board, _of(seen.spike, used), _of(seen.rgb, used), mirror=mirror, model=model, lenses=lenses)
+        if fit.calibration.mirrored and known["arm"] == "convention":
+            verdict.warnings.append(
+                "one arm is mirrored, which of them a checkerboard cannot tell: the RGB arm is taken by convention, so "
+                "that spikes need no flip. --mirror spike says otherwise; a ChArUco board knows"
+            )
         judge_fit(fit, [n for n, u in zip(seen.names, used, strict=True) if u], verdict)
     except (NumericsError, np.linalg.LinAlgError) as error:
         if verdict.accepted:
             verdict.refuse("no-fit", f"no calibration fits these views: {error}")
-    return Measured(board, seen, used, verdict, fit, mirrored_board)
+    return Measured(board, seen, used, verdict, fit, mirrored_board, known)
 
 
 def _hint(mirrored: tuple[bool | None, bool | None]) -> MirrorHint:
     if mirrored[0] == mirrored[1]:
         return "none"
     return "spike" if mirrored[0] else "rgb"
+
+
+def _in_a_mirror(board: Board, sight: Sight) -> Sight:
+    """The board's mirror picture for the board: pixels stay, labels are swapped left to right."""
+    px = np.stack([board.relabelled(p, 0, mirrored=True) for p in sight.px])
+    return replace(sight, px=px, seen=np.stack([board.relabelled(s, 0, mirrored=True) for s in sight.seen]))
 
 
 def _of(sight: Sight, views: NDArray[np.bool_]) -> Sight:
@@ -143,12 +165,12 @@ def report(measured: Measured, forced: bool = False) -> dict[str, Any]:
         "views_used": 0 if fit is None else int(fit.match.agree.sum()),
         "pairs_seen": int(pairs.sum()),
         "rms_px": {"spike": None, "rgb": None, "stereo": None},
-        "fx_px": None, "baseline_mm": None, "model": None, "mirrored": None,
+        "fx_px": None, "baseline_mm": None, "model": None, "mirrored": None, "mirror": None,
         "coverage": {"spike": coverage(seen.spike), "rgb": coverage(seen.rgb)},
         "views": [],
     }  # fmt: skip
     if fit is not None:
-        told |= _fit_json(fit)
+        told |= _fit_json(fit) | {"mirror": measured.mirror}
         told["views"] = _views_json(measured, fit)
     return told
 

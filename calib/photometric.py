@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.calib.flat import FlatField
 from spikerig.dataset.errors import DataError, UsageError
+from spikerig.dataset.flat import FlatField
 from spikerig.dataset.spikes import SpikeFile
 from spikerig.dataset.texture import window_sum
 

@@ -41,6 +41,7 @@ def poses(
     square_mm: Annotated[float, typer.Option(help="Its squares.")] = 0.0,
     seed: Annotated[int, typer.Option(help="Of RANSAC and of the mapper.")] = 1,
     threads: Annotated[int, typer.Option(help="Of features and matches; 0: one a core.")] = 0,
+    sheet: Annotated[Path | None, typer.Option(help="A contact sheet of the scene written (.html).")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace earlier results; keep refused ones.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
 ) -> None:
@@ -60,6 +61,7 @@ def poses(
     )  # fmt: skip
     if out is not None and (out / "poses.json").exists() and not force:
         raise UsageError("there is an earlier result", value=out / "poses.json", next="give --force to replace it")
+    draw = None if sheet is None else _sheet(sheet, bool(write or write_to), force)
     if source.is_dir():
         if write or write_to:
             raise UsageError("--write is for scene files", value=source)
@@ -83,11 +85,24 @@ def poses(
             next="try --peak-threshold 0.0015, other --kinds, or capture more views; --force keeps them, and says so",
         )
     _tell(told)
+    if draw is not None and told.get("written"):
+        draw(Path(told["written"]))
     if as_json:
         emit("spikerig.calib.poses/1", told | ({"error": refused.as_json()} if refused else {}))
         raise typer.Exit(refused.exit_code if refused else 0)
     if refused:
         raise refused
+
+
+def _sheet(out: Path, writes: bool, force: bool) -> Any:
+    """What draws the contact sheet of the scene written; a wish that cannot be met is refused before the work."""
+    from spikerig.calib.pose_sheet import write_sheet
+    from spikerig.dataset.outfile import refuse_existing
+
+    if not writes:
+        raise UsageError("a sheet shows the scene that was written", value=out, next="give --write or --write-to")
+    refuse_existing(out, force)
+    return lambda scene: write_sheet(scene, out, force=force)
 
 
 def _scene(
@@ -104,6 +119,8 @@ def _scene(
 
     from spikerig.calib.posed_scene import write_poses
     from spikerig.calib.poses import estimate_poses
+    from spikerig.calib.straight import straight_of
+    from spikerig.dataset.provenance import origin_of
     from spikerig.dataset.store import open_scene
 
     with open_scene(source) as scene:
@@ -111,9 +128,13 @@ def _scene(
         views = [v for v in views if v.spikes is not None or (wanted.arms == "rgb" and v.split == "train")]
         bar = Progress("mapping", 0, "steps")
         keep = None if out is None else out / "colmap"
-        estimate = estimate_poses(views, scene.camera, wanted, options, keep=keep, done=lambda step: bar.step(1, step))
+        estimate = estimate_poses(
+            views, scene.camera, wanted, options, straight=straight_of(scene), keep=keep,
+            done=lambda step: bar.step(1, step),
+        )  # fmt: skip
         known = {v.name: v.pose.cam_from_world for v in views}
-        size = _size(views, estimate, scene.camera, board)
+        size = _size(views, estimate, scene.camera, board, straight_of(scene))
+        origin = origin_of(scene, "h5py")
         simulated = scene.has_truth and "poses" not in scene.info
     told = report(estimate, options)
     told["source"] = str(source)
@@ -123,7 +144,8 @@ def _scene(
     told["forced"] = bool(estimate.reasons) and force
     if (write or write_to) and (told["accepted"] or force):
         left_out = ("poses", "source", "seconds")
-        record = {k: v for k, v in told.items() if k not in left_out}
+        record = {k: v for k, v in told.items() if k not in left_out} | origin
+        record["versions"] |= told["versions"]
         if size and size["mm_per_unit"]:
             note(f"a unit of the estimate's own world is {size['mm_per_unit']:.2f} mm +- {size['sd']:.2f}")
         told |= write_poses(source, estimate, record, out=write_to, force=force)
@@ -138,7 +160,7 @@ def _board(pattern: str, square_mm: float) -> Any:
     return board_of(pattern, square_mm) if pattern else None
 
 
-def _size(views: Any, estimate: Any, camera: Any, board: Any) -> dict[str, Any] | None:
+def _size(views: Any, estimate: Any, camera: Any, board: Any, straight: Any) -> dict[str, Any] | None:
     """Millimetres a unit of the estimate's world, or why not; None where no board was named."""
     from dataclasses import asdict
 
@@ -148,7 +170,11 @@ def _size(views: Any, estimate: Any, camera: Any, board: Any) -> dict[str, Any] 
 
     if board is None:
         return None
-    seen = {v.name: find(texture_at(v, 0.5, "tfp128").light, board) for v in views if v.name in estimate.poses}
+    seen = {
+        v.name: find(texture_at(v, 0.5, "tfp128", None, straight).light, board)
+        for v in views
+        if v.name in estimate.poses
+    }
     found = scale_of(estimate.poses, {n: f for n, f in seen.items() if f is not None}, camera, board)
     return asdict(found) if isinstance(found, Scale) else {"mm_per_unit": None, "reason": found}
 
@@ -211,11 +237,21 @@ def report(estimate: Any, options: Any) -> dict[str, Any]:
         "paths": len(estimate.paths),
         "path_chi2": {n: p.chi2 for n, p in sorted(estimate.paths.items())},
         "observations": dict(sorted(inliers.items())),
+        "residual_px": {n: p.error_px for n, p in sorted(best.poses.items()) if p.error_px is not None},
+        "point_residuals": quantiles(best.error),
         "poses": {n: p.tolist() for n, p in sorted(estimate.poses.items())},
         "options": asdict(options),
         "versions": machine.describe()["versions"] | {"pycolmap": best.version},
         "seconds": dict(estimate.seconds or best.seconds),
     }
+
+
+def quantiles(values: Any, count: int = 200) -> list[float]:
+    """That many quantiles, evenly spread; all values where there are fewer."""
+    import numpy as np
+
+    at = np.sort(np.asarray(values, np.float64))
+    return at.tolist() if len(at) <= count else np.quantile(at, (np.arange(count) + 0.5) / count).tolist()
 
 
 def against(estimate: Any, known: dict[str, Any]) -> dict[str, Any] | None:

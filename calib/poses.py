@@ -16,6 +16,7 @@ from spikerig.calib.gauge import centres, extent
 from spikerig.calib.mapping import Map, Options, build_map
 from spikerig.calib.pattern import fixed_pattern
 from spikerig.calib.pictures import KINDS, Looks, frame_picture, looks, picture_of, texture_of
+from spikerig.calib.straight import Straight
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.scene import Camera, View
 from spikerig.dataset.texture import Texture
@@ -98,6 +99,7 @@ def estimate_poses(
     *,
     rgb_camera: Camera | None = None,
     spike_from_rgb: Floats | None = None,
+    straight: Straight = Straight(),
     keep: Any = None,
     done: Callable[[str], None] = lambda step: None,
 ) -> Estimate:
@@ -109,6 +111,7 @@ def estimate_poses(
         wanted, options: what, and how COLMAP does it.
         rgb_camera: of the frames; None: the same as `camera`.
         spike_from_rgb: [3,4] for `both`; None: one centre, one direction.
+        straight: what puts textures of raw spikes onto `camera`.
         keep: folder for COLMAP's files of the best map.
         done: called with the name of each step, by several threads.
 
@@ -131,10 +134,10 @@ def estimate_poses(
         found = build_map(pictures, rgb_camera or camera, options, keep=keep, done=done)
         return _judged(Estimate(names, {n: p.pose for n, p in found.poses.items()}, {}, found, ("rgb",)), wanted)
     gain = gain_of(usable) if wanted.pattern else None
-    ranked = _ranked(usable, wanted, gain)
+    ranked = _ranked(usable, wanted, gain, straight)
     done("textures ranked")
     kinds = wanted.kinds or tuple(look.kind for look in ranked)
-    rigged = _Rigged(usable, camera, wanted, options, rgb_camera or camera, spike_from_rgb, keep, done, gain)
+    rigged = _Rigged(usable, camera, wanted, options, rgb_camera or camera, spike_from_rgb, keep, done, gain, straight)
     maps = _side_by_side(rigged, kinds[: wanted.maps])
     enough = wanted.min_share * len(usable)
     spare = [k for k in kinds[wanted.maps :] if k not in maps]
@@ -160,6 +163,7 @@ class _Rigged:
     keep: Any
     done: Callable[[str], None]
     gain: Floats | None
+    straight: Straight
 
     @property
     def phases(self) -> Floats:
@@ -169,13 +173,13 @@ class _Rigged:
     def map(self, kind: str, first: bool = False) -> Map:
         """Map the middle instants by one kind of texture; the first map also takes the further instants."""
         folder = "spike/" if self.wanted.arms == "both" else ""
-        pictures = {f"{folder}{v.name}": look_at(v, 0.5, kind, self.gain) for v in self.views}
+        pictures = {f"{folder}{v.name}": look_at(v, 0.5, kind, self.gain, self.straight) for v in self.views}
         further = {}
         if first and self.wanted.instants > 1:
             for v in self.views:
                 for k, phase in enumerate(self.phases):
                     if abs(phase - 0.5) > 1e-9:
-                        picture = look_at(v, phase, kind, self.gain)
+                        picture = look_at(v, phase, kind, self.gain, self.straight)
                         further[f"{folder}{v.name}.at{k:03d}"] = (f"{folder}{v.name}", picture)
         rig = None
         if self.wanted.arms == "both":
@@ -248,22 +252,28 @@ def gain_of(views: Sequence[View]) -> Floats | None:
     return fixed_pattern([v.spikes for v in views if v.spikes is not None])
 
 
-def look_at(view: View, phase: float, kind: str, gain: Floats | None = None) -> NDArray[np.uint8]:
-    """The picture of a view by a kind of texture, at a phase of the exposure; light is divided by the gain."""
+def look_at(
+    view: View, phase: float, kind: str, gain: Floats | None = None, straight: Straight = Straight()
+) -> NDArray[np.uint8]:
+    """The picture of a view by a kind of texture, at a phase of the exposure; the others as in `texture_at`."""
     if view.spikes is None:
         raise UsageError("this view has no spikes", value=view.name)
     if kind[:3] == "tfp" and kind[3:].isdigit() and int(kind[3:]) > view.spikes.ticks:
         told = f"{view.name}, {kind}: {view.spikes.ticks} ticks"
         raise UsageError("a texture does not fit the spikes", value=told, next="ask for a shorter window")
-    return picture_of(texture_at(view, phase, kind, gain))
+    return picture_of(texture_at(view, phase, kind, gain, straight))
 
 
-def texture_at(view: View, phase: float, kind: str, gain: Floats | None = None) -> Texture:
-    """The texture of a view by a kind, at a phase of the exposure; light is divided by the gain."""
+def texture_at(
+    view: View, phase: float, kind: str, gain: Floats | None = None, straight: Straight = Straight()
+) -> Texture:
+    """The texture of a view by a kind, at a phase of the exposure; divided by the gain, then put straight."""
     if view.spikes is None:
         raise UsageError("this view has no spikes", value=view.name)
-    texture = texture_of(view.spikes, tick_at(view, phase), kind)
-    return texture if gain is None else replace(texture, light=(texture.light / gain).astype(np.float32))
+    raw = texture_of(view.spikes, tick_at(view, phase), kind)
+    if gain is not None:
+        raw = replace(raw, light=(raw.light / gain).astype(np.float32))
+    return straight.texture(raw)
 
 
 def tick_at(view: View, phase: float) -> float:
@@ -271,11 +281,11 @@ def tick_at(view: View, phase: float) -> float:
     frame, spikes = view.frame, view.spikes
     if spikes is None or spikes.rate_hz is None:
         raise UsageError("this view has no spikes with a known rate", value=view.name)
-    start = frame.mid_ns - frame.exposure_ns / 2
+    start = view.mid_ns - frame.exposure_ns / 2
     return float((start + phase * frame.exposure_ns - spikes.t0_ns) * spikes.rate_hz * 1e-9)
 
 
-def _ranked(views: Sequence[View], wanted: Wanted, gain: Floats | None) -> tuple[Looks, ...]:
+def _ranked(views: Sequence[View], wanted: Wanted, gain: Floats | None, straight: Straight) -> tuple[Looks, ...]:
     """Kinds of texture, best first, as measured on a few views; kinds whose window leaves the spikes are left out."""
     if len(wanted.kinds) == 1:
         return ()
@@ -283,8 +293,8 @@ def _ranked(views: Sequence[View], wanted: Wanted, gain: Floats | None) -> tuple
     found = []
     for kind in wanted.kinds or KINDS:
         try:
-            pairs = [(look_at(v, APART[0], kind, gain), look_at(v, APART[1], kind, gain)) for v in some]
-            found.append(looks([p for pair in pairs for p in pair], kind, pairs))
+            pairs = [tuple(look_at(v, phase, kind, gain, straight) for phase in APART) for v in some]
+            found.append(looks([p for pair in pairs for p in pair], kind, [(a, b) for a, b in pairs]))
         except UsageError:
             if wanted.kinds:
                 raise
@@ -295,7 +305,7 @@ def _ranked(views: Sequence[View], wanted: Wanted, gain: Floats | None) -> tuple
 
 def best_kind(views: Sequence[View], gain: Floats | None = None) -> str:
     """The kind of texture whose features are found again best on these views."""
-    return _ranked(views, Wanted(), gain)[0].kind
+    return _ranked(views, Wanted(), gain, Straight())[0].kind
 
 
 def _arm(found: Map, folder: str) -> Map:

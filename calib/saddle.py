@@ -18,10 +18,13 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 ROUNDS = 15
 SHARPEST = -3.0  # log of the least blur, px
+REACH = 0.6  # of the way to the next edge
 FARTHEST = 1.5  # px a corner may move from where the detector put it
 
 
-def refine(light: NDArray[Any], px: Floats, seen: NDArray[np.bool_], cols: int, rows: int) -> Floats:
+def refine(
+    light: NDArray[Any], px: Floats, seen: NDArray[np.bool_], cols: int, rows: int, reach: float = REACH
+) -> Floats:
     """Corners refined.
 
     Args:
@@ -29,12 +32,13 @@ def refine(light: NDArray[Any], px: Floats, seen: NDArray[np.bool_], cols: int, 
         px: float64[cols*rows,2] corners to a pixel or so (centres at +0.5), row by row.
         seen: bool[cols*rows], at least four of them.
         cols, rows: of the board.
+        reach: how much of the way to the next edge shows the two edges and nothing else: less where markers are.
 
     Returns:
         float64[cols*rows,2]; a corner that is not seen, whose fit fails, or runs off, stays where it was.
 
     Edges:
-        The window of a corner is a disc that reaches 0.6 of the way to the next edges, at most 15 px; corners
+        The window of a corner is a disc that reaches that part of the way to the next edges, at most 15 px; corners
         nearer than two pixels to the next edge or to the picture's rim stay where they are.
 
     Cost:
@@ -43,7 +47,7 @@ def refine(light: NDArray[Any], px: Floats, seen: NDArray[np.bool_], cols: int, 
     along, down = _directions(px, seen, cols, rows)
     area = np.abs(along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0])
     room = area / np.maximum(np.linalg.norm(along, axis=-1), np.linalg.norm(down, axis=-1))  # to the nearest edge
-    radius = np.where(seen & np.isfinite(room), np.clip(0.6 * room, 0, 15), 0)
+    radius = np.where(seen & np.isfinite(room), np.clip(reach * room, 0, 15), 0)
     half = int(np.ceil(radius.max())) + 1
     at = np.floor(np.where(seen[:, None], px, -1)).astype(int)
     inside = (at >= half).all(1) & (at < np.array(light.shape[1::-1]) - half).all(1) & (radius >= 2)

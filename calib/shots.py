@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -76,6 +76,12 @@ def pair_up(spike_dir: Path, rgb_dir: Path) -> tuple[list[Pair], str]:
             expected="equal stems, e.g. spike/07.dat and rgb/07.png", next="rename them, view by view",
         )  # fmt: skip
     return [Pair(a.stem, a, b) for a, b in zip(*both, strict=True)], "order"
+
+
+def unpaired(pairs: Sequence[Pair], spike_dir: Path, rgb_dir: Path) -> list[str]:
+    """Names of the files of two folders that are in no pair, as folder/name."""
+    taken = {path for pair in pairs for path in (pair.spike, pair.rgb)}
+    return [f"{p.parent.name}/{p.name}" for folder in (spike_dir, rgb_dir) for p in files_in(folder) if p not in taken]
 
 
 def files_in(folder: Path) -> list[Path]:

@@ -17,11 +17,13 @@ Floats = NDArray[np.float64]
 MIN_VIEWS = 4
 GOOD_VIEWS = 10
 FOCAL_SD = 0.02  # of the focal length: more than this and the boards have not fixed it
-MONO = 2e-3  # of the diagonal: corners this far from any lens are not corners of this board
+MONO = 1e-3  # of the diagonal: corners this far from any lens are not corners of this board
+POOR = MONO / 2  # ... and from here on it is said (0.24 px of 400x250)
 APART = 1e-3  # of the diagonal: arms that together fit no better than this are not one rig...
 FAR_ABOVE = 3.0  # ... where each alone fits so many times better
 REPEAT = 0.6e-3  # of the diagonal: a board that moved less between two views is the same view twice
 CROP_PX = 0.25
+LOOSE = 1e-2  # of the diagonal: a crop that is known no better than this somewhere in the picture is none
 
 
 @dataclass(slots=True)
@@ -142,7 +144,14 @@ def judge_fit(fit: RigFit, names: Sequence[str], verdict: Verdict) -> None:
     if not _judge_pairs(fit, names, verdict):
         return  # what else is known of the step between the arms means nothing
     worst = fit.sure.worst_crop_px
-    if worst > CROP_PX:
+    if worst > LOOSE * _diagonal(fit.spike.sight):
+        verdict.refuse(
+            "loose-crop",
+            f"the crop is only known to {worst:.1f} px at the rim of the spike picture, at most "
+            f"{LOOSE * _diagonal(fit.spike.sight):.1f} are kept: views do not agree with each other. Is the board flat "
+            "and rigid, was it shown at the rim, too? Shoot more views",
+        )
+    elif worst > CROP_PX:
         verdict.warnings.append(
             f"the crop is only known to {worst:.2f} px at the rim of the spike picture: show the board there too"
         )
@@ -180,6 +189,11 @@ def _judge_lenses(fit: RigFit, names: Sequence[str], verdict: Verdict) -> bool:
                 f"the {label} arm alone fits its corners only to {rms:.2f} px. Is the board flat and rigid, were "
                 "pictures sharp, is --pattern right?",
             )
+        elif rms > POOR * _diagonal(mono.sight):
+            verdict.warnings.append(
+                f"the {label} arm alone fits its corners to {rms:.2f} px, where good boards fit to a tenth: is the "
+                "board flat and rigid, were pictures sharp?"
+            )
         f, unsure = float(mono.fit.lenses[0][0][0, 0]), focal_sd(fit, arm)
         if not unsure <= FOCAL_SD:
             known = False
@@ -212,7 +226,7 @@ def _judge_pairs(fit: RigFit, names: Sequence[str], verdict: Verdict) -> bool:
     stereo = pair_rms_px(fit)
     apart = 2 * agree <= pairs or fit.fit.rms_px() > max(FAR_ABOVE * mono, APART * diagonal)
     if apart:
-        tried = "as they are and mirrored" if fit.other is not None else "as they are"
+        tried = "as they are and mirrored" if fit.other is not None else "only as markers or --mirror say"
         verdict.refuse(
             "not-one-rig",
             f"stereo residual far above mono: the arms were tried {tried}, and together fit only to {stereo:.2f} px "

@@ -54,6 +54,9 @@ def texture(
     bayer: Annotated[
         str, typer.Option(help="Colours of the pixels: rggb, grbg, gbrg, bggr; off; auto: as the scene says.")
     ] = "auto",
+    flat: Annotated[
+        Path | None, typer.Option(help="The sensor's maps (.npz of `calib photometric`): evens the texture out.")
+    ] = None,
     height: Height = None,
     width: Width = None,
     row_bits: RowBits = None,
@@ -63,6 +66,7 @@ def texture(
     as_json: Json = False,
 ) -> None:
     """Make a picture of the spikes around an instant."""
+    from spikerig.dataset.flat import flattened, read_flat
     from spikerig.dataset.outfile import refuse_existing
     from spikerig.dataset.spikes import open_spikes
 
@@ -79,6 +83,7 @@ def texture(
         raise UsageError("no such Bayer pattern", value=bayer, expected=f"auto, off, {', '.join(PATTERNS)}")
     number = _gain(gain)
     refuse_existing(out, force)
+    maps = None if flat is None else read_flat(flat)
     opened = (
         _view(file, view)
         if view is not None or is_scene(file)
@@ -86,13 +91,14 @@ def texture(
     )
     with opened:
         made, used = _make(opened, method, at, 41 if window is None else window, intervals, reach)
+        made = made if maps is None else flattened(made, maps)
         made, pattern = _coloured(made, bayer, opened)
     used_gain = _write(out, made, number, force)
     told = {
         "file": str(file), "out": str(out), "method": made.method, "at": at, "width": made.light.shape[1],
         "height": made.light.shape[0], "window": [used[0], used[1]], "known": float(made.known.mean()),
         "mean_light": float(made.light[made.known].mean()) if made.known.any() else None, "gain": used_gain,
-        "bayer": pattern,
+        "bayer": pattern, "flat": None if flat is None else str(flat),
     }  # fmt: skip
     if as_json:
         emit("spikerig.data.texture/1", told)

@@ -37,13 +37,17 @@ def info(
     drop_tail: DropTail = False,
     as_json: Json = False,
 ) -> None:
-    """Say what a file is: spikes (.dat .bin .npz .h5), a scene (.h5), a texture (.npy) or a picture."""
+    """Say what a file is: spikes (.dat .bin .npz .h5), a scene (.h5), a GoPro clip (.mp4), a texture or a picture."""
     layout = {"height": height, "width": width, "row_bits": row_bits, "axes": axes, "rate_hz": rate_hz}
     raw = any(v is not None for v in layout.values()) or drop_tail
     if not raw and file.suffix.lower() in PICTURES:
         found = _picture(file)
     elif not raw and file.suffix.lower() == ".npy":
         found = _array(file)
+    elif not raw and file.suffix.lower() == ".mp4":
+        from spikerig.dataset.gopro_info import describe_clip
+
+        found = describe_clip(file)
     elif not raw and is_scene(file):
         found = _scene(file)
     else:

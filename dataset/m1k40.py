@@ -92,6 +92,11 @@ def _decode(file: BinaryIO, path: Path, start: int, first: int, out: Bits) -> No
             cause="the host dropped data while recording; how many ticks are missing is not in the file",
             next=f"use the ticks before {tick}, or cut the file behind it and read the rest as a recording of its own",
         )
+    unpack_blocks(data.reshape(-1), out)
+
+
+def unpack_blocks(data: Bits, out: Bits) -> None:
+    """Whole ticks of blocks, uint8[n * 128000], as packed ticks uint8[n,1000,125]; the inverse of `pack_blocks`."""
     # 500 pixels are 62.5 bytes: the second half of a row starts in the middle of byte 62
     rows = data.reshape(len(out), SIDE, 2, BLOCK)
     left, right = rows[:, :, 0, :63], rows[:, :, 1, :63]
@@ -114,17 +119,21 @@ def write_m1k40(path: Path, stream: SpikeStream) -> None:
     """
     if (stream.height, stream.width) != (SIDE, SIDE):
         raise UsageError("an M1K40 stream is 1000x1000", value=f"{stream.height}x{stream.width}")
+    with path.open("wb") as file:
+        for t in range(0, stream.ticks, _STEP):
+            file.write(pack_blocks(stream.bits[t : t + _STEP]).tobytes())
+
+
+def pack_blocks(ticks: Bits) -> Bits:
+    """Packed ticks [T,1000,125] as tagged blocks, uint8[T,1000,2,64]; see `write_m1k40` for the tags."""
     line = np.concatenate([np.arange(HALF, 0, -1), np.arange(1, HALF + 1)])
     channel = np.repeat([0, 2], HALF)
     tags = ((channel[:, None] + [0, 1]) * 1024 + line[:, None]).astype(np.uint16)
-    with path.open("wb") as file:
-        for t in range(0, stream.ticks, _STEP):
-            ticks = stream.bits[t : t + _STEP]
-            rows = np.zeros((len(ticks), SIDE, 2, BLOCK), np.uint8)
-            rows[:, :, 0, :62] = ticks[:, :, :62]
-            rows[:, :, 0, 62] = ticks[:, :, 62] & 15
-            rows[:, :, 1, :62] = (ticks[:, :, 62:124] >> 4) | (ticks[:, :, 63:125] << 4)
-            rows[:, :, 1, 62] = ticks[:, :, 124] >> 4
-            rows[..., 62] |= ((tags & 15) << 4).astype(np.uint8)
-            rows[..., 63] = (tags >> 4).astype(np.uint8)
-            file.write(rows.tobytes())
+    rows = np.zeros((len(ticks), SIDE, 2, BLOCK), np.uint8)
+    rows[:, :, 0, :62] = ticks[:, :, :62]
+    rows[:, :, 0, 62] = ticks[:, :, 62] & 15
+    rows[:, :, 1, :62] = (ticks[:, :, 62:124] >> 4) | (ticks[:, :, 63:125] << 4)
+    rows[:, :, 1, 62] = ticks[:, :, 124] >> 4
+    rows[..., 62] |= ((tags & 15) << 4).astype(np.uint8)
+    rows[..., 63] = (tags >> 4).astype(np.uint8)
+    return rows

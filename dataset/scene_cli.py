@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -12,15 +13,24 @@ from spikerig.dataset.terminal import emit, note
 
 
 def verify(
-    file: Path = typer.Argument(..., help="A scene file (RS-3D HDF5)."),
+    file: Path = typer.Argument(..., help="A scene file (RS-3D HDF5), or the folder of a raw take."),
     as_json: bool = typer.Option(False, "--json", help="One JSON document on stdout."),
 ) -> None:
-    """Check a scene file against its schema and every checksum: exit 0 all well, 1 findings, 4 unreadable."""
-    from spikerig.dataset.store import verify_scene
+    """Check a scene file, or every chunk of a take, against all checksums: exit 0 well, 1 findings, 4 unreadable."""
+    figures: dict[str, Any] = {}
+    if file.is_dir():
+        from spikerig.dataset.rawtake import verify_take
 
-    found = verify_scene(file)
+        found, figures = verify_take(file)
+    else:
+        from spikerig.dataset.store import verify_scene
+
+        found = verify_scene(file)
     if as_json:
-        emit("spikerig.data.verify/1", {"file": str(file), "ok": not found, "findings": [asdict(f) for f in found]})
+        told = {"file": str(file), "ok": not found, "findings": [asdict(f) for f in found], **figures}
+        emit("spikerig.data.verify/1", told)
+    if figures:
+        note(", ".join(f"{key.replace('_', ' ')} {value}" for key, value in figures.items()))
     for one in found:
         note(f"{one.importance}: {one.where}: {one.message}" + (f" ({one.fix})" if one.fix else ""))
     note(f"{file}: {f'{len(found)} findings' if found else 'all well'}")

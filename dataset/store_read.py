@@ -85,6 +85,12 @@ class SceneFile:
         self._file.close()
 
     @property
+    def sha256(self) -> str | None:
+        """Checksum of the whole content, as stored; None in an unfinished file."""
+        with hdf5_faults(self.path):
+            return stored_digest(self._file) or None
+
+    @property
     def points(self) -> Points | None:
         """The sparse points, None if there are none."""
         with hdf5_faults(self.path):
@@ -162,6 +168,18 @@ class SceneFile:
             t0_ns = int(ns_from_tick(t0, rate_hz, t0_ns)) if rate_hz else t0_ns
         lost = np.clip(lost - (t0 or 0), 0, len(bits))
         return SpikeStream(bits, width, rate_hz, t0_ns, clock, lost[lost[:, 0] < lost[:, 1]])
+
+    def has_spikes(self, name: str) -> bool:
+        """Whether a view has spikes."""
+        group = self._group(name)
+        with hdf5_faults(self.path):
+            return has(group, "spikes")
+
+    def ticks(self, name: str) -> int:
+        """How many ticks of spikes a view has; 0 without."""
+        group = self._group(name)
+        with hdf5_faults(self.path):
+            return dataset_at(group, "spikes").shape[0] if has(group, "spikes") else 0
 
     def has_events(self, name: str) -> bool:
         """Whether an event camera saw this view too."""
@@ -254,7 +272,7 @@ class SceneFile:
         with hdf5_faults(self.path):
             for name in self.names:
                 group = self._group(name)
-                ticks[name] = dataset_at(group, "spikes").shape[0] if has(group, "spikes") else 0
+                ticks[name] = self.ticks(name)
                 if has(group, "events"):
                     events[name] = count_events(group_at(group, "events"))
             points = self.points
@@ -276,7 +294,7 @@ class SceneFile:
                 "truth": self.truth_label or None,
                 "clock": self.clock is not None,
                 "calibration": self.calibration is not None,
-                "sha256": stored_digest(self._file) or None,
+                "sha256": self.sha256,
                 "info": self.info,
             }
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from spikerig.dataset.errors import RigError
 from spikerig.dataset.hdf5_guard import hdf5_faults, printable, walk
-from spikerig.dataset.scene import Finding
+from spikerig.dataset.scene import ERROR, NOTE, WARNING, Finding
 from spikerig.dataset.store import (
     DIGEST,
     ROWS,
@@ -46,10 +46,10 @@ def verify_here(path: str) -> list[dict[str, Any]]:
         found: list[Finding] = []
         if status != "complete":
             fix = "write it again; open_scene(path, partial=True) reads the views that are whole"
-            found.append(Finding("status", "violation", "/", f"status {status}: its writer did not finish", fix))
+            found.append(Finding("status", ERROR, "/", f"status {status}: its writer did not finish", fix))
         for thing in walk(file):
             found += _check(thing, sealed=status == "complete")
-        if not any(f.importance == "critical" for f in found):
+        if not any(f.importance == ERROR for f in found):
             found += _check_records(file, path)
         return [asdict(f) for f in found]
 
@@ -58,16 +58,16 @@ def _check(thing: h5py.Group | h5py.Dataset, sealed: bool) -> Iterator[Finding]:
     where = printable(thing.name)
     row = row_of(thing.name)
     if row is None:
-        yield Finding("schema", "suggestion", where, "not in the schema: not read", "is the file of a newer version?")
+        yield Finding("schema", NOTE, where, "not in the schema: not read", "is the file of a newer version?")
     else:
         yield from _check_row(thing, row, where)
     stored = stored_digest(thing)
     if not stored and (sealed or where == "/views"):
-        yield Finding("checksum", "violation", where, "no checksum", "written by another program?")
+        yield Finding("checksum", WARNING, where, "no checksum", "written by another program?")
     elif stored and stored != digest(thing):
         what = "data or attributes" if isinstance(thing, h5py.Dataset) else "attributes or members"
         fix = "get the file again from its source"
-        yield Finding("checksum", "critical", where, f"its {what} are not those that were written", fix)
+        yield Finding("checksum", ERROR, where, f"its {what} are not those that were written", fix)
 
 
 def _check_row(thing: h5py.Group | h5py.Dataset, row: Row, where: str) -> Iterator[Finding]:
@@ -76,25 +76,25 @@ def _check_row(thing: h5py.Group | h5py.Dataset, row: Row, where: str) -> Iterat
         try:
             read_attr(thing, name)
         except RigError as error:
-            yield Finding("schema", "critical", where, error.cause or error.what, fix)
+            yield Finding("schema", ERROR, where, error.cause or error.what, fix)
     for name in sorted(set(thing.attrs) - set(row.attrs) - {DIGEST}):
-        yield Finding("schema", "suggestion", where, f"the attribute {name!r} is not in the schema: not read")
+        yield Finding("schema", NOTE, where, f"the attribute {name!r} is not in the schema: not read")
     if (row.dtype == "group") != isinstance(thing, h5py.Group):
-        yield Finding("schema", "critical", where, f"not the {row.dtype} that belongs there", fix)
+        yield Finding("schema", ERROR, where, f"not the {row.dtype} that belongs there", fix)
     elif isinstance(thing, h5py.Group):
         prefix = row.path.rstrip("/") + "/"
         members = [r for p, r in ROWS.items() if p.startswith(prefix) and "/" not in p[len(prefix) :] and p != "/"]
         for below in members:
             if below.required and not has(thing, below.path[len(prefix) :]):
-                yield Finding("schema", "critical", where, f"{below.path[len(prefix) :]} is missing", fix)
+                yield Finding("schema", ERROR, where, f"{below.path[len(prefix) :]} is missing", fix)
     else:
         try:
             check_shape(thing)
         except RigError as error:
-            yield Finding("schema", "critical", where, error.cause or error.what, fix)
+            yield Finding("schema", ERROR, where, error.cause or error.what, fix)
         else:
             if thing.dtype.kind == "f" and not np.isfinite(thing[()]).all():
-                yield Finding("finite", "violation", where, "values that are not finite")
+                yield Finding("finite", ERROR, where, "values that are not finite")
 
 
 def _check_records(file: h5py.File, path: str) -> Iterator[Finding]:
@@ -111,7 +111,7 @@ def _check_records(file: h5py.File, path: str) -> Iterator[Finding]:
         yield from _try(where, lambda name=name: scene.view(name, spikes=False))
         group = group_at(group_at(file, "views"), name)
         if has(group, "spikes") != has(group, "lost"):
-            yield Finding("schema", "critical", where, "spikes without lost, or lost without spikes")
+            yield Finding("schema", ERROR, where, "spikes without lost, or lost without spikes")
         elif has(group, "spikes"):
             spikes = dataset_at(group, "spikes")
             yield from _try(where, lambda name=name, spikes=spikes: _read_spikes(scene, name, spikes))
@@ -140,4 +140,4 @@ def _try(where: str, read: Any) -> Iterator[Finding]:
 
 
 def _told(where: str, error: RigError) -> Finding:
-    return Finding("record", "critical", where, f"{error.what} {error.cause}".strip())
+    return Finding("record", ERROR, where, f"{error.what} {error.cause}".strip())

@@ -43,22 +43,49 @@ class Lens:
         # within a pixel a lens is straight to 1e-4 px
         self.rays = np.stack([middle + by[0] * (a - 0.5) + by[1] * (b - 0.5) for a, b in px]).astype(np.float32)
 
-    def picture(self, pose: np.ndarray, black: float = 0.05, white: float = 0.8, behind: float = 0.3,
-                cols: int = COLS, rows: int = ROWS, square: float = SQUARE) -> np.ndarray:  # fmt: skip
-        """Linear light float32[H,W] of a board with a white rim at cam_from_board."""
-        H = np.linalg.inv(np.stack([pose[:, 0], pose[:, 1], pose[:, 3]], 1))  # plane point from direction
+    def on_board(self, pose: np.ndarray, curl: float = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where rays meet a board at cam_from_board that curls by z = curl x^2: x, y in mm, and how far ahead."""
+        q = pose[:, :3].T @ pose[:, 3]
         x, y = self.rays[..., 0], self.rays[..., 1]
-        u, v, w = (np.float32(r[0]) * x + np.float32(r[1]) * y + np.float32(r[2]) for r in H)
-        i, j = (u / w / square + (cols + 1) / 2), (v / w / square + (rows + 1) / 2)
-        dark = (np.floor(i).astype(np.int32) + np.floor(j).astype(np.int32)) & 1
-        light = np.where(dark == 1, np.float32(black), np.float32(white))
+        u, v, w = (np.float32(r[0]) * x + np.float32(r[1]) * y + np.float32(r[2]) for r in pose[:, :3].T)
+        z, ahead = np.float32(0), np.float32(q[2]) / w
+        for _ in range(5 if curl else 0):
+            z = np.float32(curl) * (u * ahead - np.float32(q[0])) ** 2
+            ahead = (np.minimum(z, 20) + np.float32(q[2])) / w
+        return u * ahead - np.float32(q[0]), v * ahead - np.float32(q[1]), ahead
+
+    def picture(self, pose: np.ndarray, black: float = 0.05, white: float = 0.8, behind: float = 0.3,
+                cols: int = COLS, rows: int = ROWS, square: float = SQUARE, curl: float = 0,
+                art: np.ndarray | None = None) -> np.ndarray:  # fmt: skip
+        """Linear light float32[H,W] of a board with a white rim at cam_from_board; `art`: what is printed on it,
+        bool[rows + 1 squares, cols + 1 squares] in any number of dots a square, where it is no checkerboard."""
+        x, y, ahead = self.on_board(pose, curl)
+        i, j = x / np.float32(square) + (cols + 1) / 2, y / np.float32(square) + (rows + 1) / 2
+        if art is None:
+            bright = (np.floor(i).astype(np.int32) + np.floor(j).astype(np.int32)) & 1 == 0
+        else:
+            high, wide = art.shape
+            down, across = (np.clip(k * (n / (m + 1)), 0, n - 1).astype(np.int32) for k, n, m in (
+                (j, high, rows), (i, wide, cols)))  # fmt: skip
+            bright = art[down, across]
+        light = np.where(bright, np.float32(white), np.float32(black))
         light[(i < 0) | (i > cols + 1) | (j < 0) | (j > rows + 1)] = white
-        light[(i < -1) | (i > cols + 2) | (j < -1) | (j > rows + 2) | (w <= 0)] = behind
+        light[(i < -1) | (i > cols + 2) | (j < -1) | (j > rows + 2) | (ahead <= 0)] = behind
         return light.mean(0)
 
     def corners(self, pose: np.ndarray, **board: float) -> np.ndarray:
         """Where the corners truly are, float64[N,2]."""
         return project(self.camera, corners(**board) @ pose[:, :3].T + pose[:, 3])
+
+
+def charuco(cols: int, rows: int, dictionary: str = "DICT_4X4_50", marker: float = 0.75) -> np.ndarray:
+    """What is printed on a ChArUco board of so many inner corners: bool, 48 dots a square, True where white."""
+    import cv2
+
+    n = 48
+    kind = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    made = cv2.aruco.CharucoBoard((cols + 1, rows + 1), 1.0, marker, kind)
+    return np.asarray(made.generateImage((n * (cols + 1), n * (rows + 1)))) > 127
 
 
 @lru_cache

@@ -8,7 +8,7 @@ from calib_rigs import BOARD, corners_seen, crop_error_px, rig, seen_of
 
 from spikerig.calib.boards import Board
 from spikerig.calib.bundle import Sight
-from spikerig.calib.crop import parallax_px
+from spikerig.calib.crop import parallax_px, rgb_px_from_spike_px, spike_px_from_rgb_px
 from spikerig.calib.measure import measure, report
 from spikerig.calib.mono import fit_lens
 from spikerig.calib.optics import fit_rig
@@ -142,7 +142,13 @@ def test_pairs_shot_at_different_instants_are_refused_in_both_parities() -> None
 
 def test_a_mirrored_arm_is_no_fault_unless_the_mirror_is_denied() -> None:
     sights = corners_seen(rig((0, 0, 0), "rgb"), VIEWS)
-    assert codes(sights) == []
+    told = report(measure(BOARD, seen_of(sights), lenses=(4,)))
+    assert told["reason_codes"] == []
+    assert told["mirror"] == {"parity": "measured", "arm": "convention"}
+    assert any("by convention" in w for w in told["warnings"])
+    given = report(measure(BOARD, seen_of(sights), mirror="rgb", lenses=(4,)))
+    assert given["mirror"] == {"parity": "given", "arm": "given"}
+    assert not any("convention" in w for w in given["warnings"])
     assert report(measure(BOARD, seen_of(sights), mirror="none", lenses=(4,)))["reason_codes"] == ["not-one-rig"]
 
 
@@ -158,8 +164,16 @@ def test_a_charuco_board_says_which_arm_is_mirrored(mirrored: tuple[bool, bool])
     arm = {(True, False): "spike", (False, True): "rgb"}.get(mirrored)
     assert told.fit.calibration.mirrored == arm
     assert told.fit.other is None
-    if mirrored != (True, True):
-        assert crop_error_px(told.fit.calibration, rig(mirrored=arm)) < 0.15
+    assert told.mirror == {"parity": "markers", "arm": "markers"}
+    found = told.fit.calibration
+    if all(mirrored):  # the world is mirrored instead, and pixels of both arms with it
+        here = np.stack(np.meshgrid(np.linspace(0, 400, 9), np.linspace(0, 250, 7)), -1)
+        want = rgb_px_from_spike_px(rig(), [400, 0] + [-1, 1] * here, 450.0)
+        want[..., 0] = found.rgb.width - want[..., 0]
+        back = spike_px_from_rgb_px(found, want, 450.0)
+        assert np.nanmax(np.linalg.norm(back - here, axis=-1)) < 0.15
+    else:
+        assert crop_error_px(found, rig(mirrored=arm)) < 0.15
 
 
 def test_odd_pairs_are_named() -> None:

@@ -12,6 +12,7 @@ from calib_worlds import ring
 from spikerig.calib import pose_cli
 from spikerig.calib.boards import Board, Found
 from spikerig.calib.scale import Scale, scale_of
+from spikerig.calib.straight import Straight
 from spikerig.dataset import cli
 from spikerig.dataset.scene import Camera, View
 from spikerig.dataset.texture import Texture
@@ -73,18 +74,18 @@ def test_boards_are_looked_for_on_the_placed_views(monkeypatch: pytest.MonkeyPat
     asked: list[str] = []
     names = {id(f): n for n, f in seen.items()}
 
-    def texture_at(view: View, phase: float, kind: str) -> Texture:
+    def texture_at(view: View, phase: float, kind: str, gain: None, straight: Straight) -> Texture:
         asked.append(view.name)
         return Texture(np.full((2, 2), int(view.name), np.float32), np.ones((2, 2), bool), 0.0, kind)
 
     monkeypatch.setattr("spikerig.calib.poses.texture_at", texture_at)
     monkeypatch.setattr("spikerig.calib.boards.find", lambda light, board: seen.get(f"{int(light[0, 0]):03d}"))
     shown: Any = [SimpleNamespace(name=n) for n in [*poses, "009"]]
-    told = pose_cli._size(shown, SimpleNamespace(poses=poses), CAMERA, BOARD)
+    told = pose_cli._size(shown, SimpleNamespace(poses=poses), CAMERA, BOARD, Straight())
     assert told is not None
     assert told["mm_per_unit"] == pytest.approx(MM, rel=1e-4)
     assert asked == list(poses) == sorted(names.values())
     del seen["000"], seen["001"], seen["002"], seen["003"], seen["004"]
-    told = pose_cli._size(shown, SimpleNamespace(poses=poses), CAMERA, BOARD)
+    told = pose_cli._size(shown, SimpleNamespace(poses=poses), CAMERA, BOARD, Straight())
     assert told == {"mm_per_unit": None, "reason": told and told["reason"]}
-    assert pose_cli._size(shown, SimpleNamespace(poses=poses), CAMERA, None) is None
+    assert pose_cli._size(shown, SimpleNamespace(poses=poses), CAMERA, None, Straight()) is None

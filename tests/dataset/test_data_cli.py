@@ -8,6 +8,7 @@ import pytest
 from spike_bytes import random_pixels, vidar
 
 from spikerig.dataset import cli, oracles, texture
+from spikerig.dataset.flat import FlatField, write_flat
 from spikerig.dataset.images import read_image, write_image
 from spikerig.dataset.spikes import SpikeStream, open_spikes, write_spikes
 
@@ -261,3 +262,28 @@ def test_a_texture_in_colour(run, tmp_path):
     assert shown.shape == (13, 21, 3)
     assert not np.array_equal(shown[:, :, 0], shown[:, :, 2])
     assert run(*words, "--bayer", "rgbg", "-o", tmp_path / "t.npy")[0] == 2
+
+
+def test_a_texture_is_evened_out_on_request(run, dat, tmp_path):
+    rng = np.random.default_rng(4)
+    gain = (1 + 0.1 * rng.standard_normal((250, 400))).astype(np.float32).clip(0.5, 2)
+    dark, good = np.full_like(gain, 0.01), np.ones(gain.shape, bool)
+    good[7, 9] = False
+    write_flat(tmp_path / "flat.npz", FlatField(gain, dark, good, np.ones_like(gain)))
+    words = ("data", "texture", dat[0], "--at", 30, "--json", "-o")
+    assert run(*words, tmp_path / "raw.npy")[0] == 0
+    code, told, _ = run(*words, tmp_path / "even.npy", "--flat", tmp_path / "flat.npz")
+    assert code == 0
+    assert told["method"] == "tfp-41-flat"
+    assert told["flat"] == str(tmp_path / "flat.npz")
+    raw, even = (np.load(tmp_path / f"{name}.npy") for name in ("raw", "even"))
+    assert np.isnan(even[7, 9])
+    np.testing.assert_allclose(even[good], np.maximum(raw - 0.01, 0)[good] / gain[good], rtol=1e-5)
+    write_flat(
+        tmp_path / "other.npz", FlatField(*(np.ones((3, 4), t) for t in (np.float32, np.float32, bool, np.float32)))
+    )
+    code, told, _ = run(*words, tmp_path / "c.npy", "--flat", tmp_path / "other.npz")
+    assert code == 2
+    assert "another sensor" in told["error"]["what"]
+    assert run(*words, tmp_path / "c.npy", "--flat", tmp_path / "none.npz")[0] == 4
+    assert not (tmp_path / "c.npy").exists()

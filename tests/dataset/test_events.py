@@ -247,7 +247,7 @@ def test_hostile_events_end_in_one_error_and_a_finding(scene: Path, case: str) -
         read_all(scene)
     assert words in str(told.value)
     assert scene.name in str(told.value)
-    found = [f for f in verify_scene(scene) if f.importance == "critical"]
+    found = [f for f in verify_scene(scene) if f.importance == "error"]
     assert any(words in f.message and f.where.startswith("/views/v-01.x") for f in found), found
 
 

@@ -269,7 +269,7 @@ def test_a_flipped_bit_in_any_dataset_is_found_and_named(scene: Path) -> None:
     scene.write_bytes(spoiled)
     found = verify_scene(scene)
     assert {f.where for f in found if f.check == "checksum"} == {name for name, _, _ in places}
-    assert {f.importance for f in found if f.check == "checksum"} == {"critical"}
+    assert {f.importance for f in found if f.check == "checksum"} == {"error"}
 
 
 @pytest.mark.parametrize("where", ["/", "/camera", "/views/a", "/views/a/pixels", "/truth"])
@@ -288,9 +288,7 @@ def test_a_newer_minor_version_is_read_with_a_note(scene: Path, capsys: pytest.C
     with open_scene(scene) as found:
         same(full_scene(), found.read())
     assert "RS-3D 1.7 is newer than this reader (1.0)" in capsys.readouterr().err
-    assert ("schema", "suggestion", "/views/a/novelty") in {
-        (f.check, f.importance, f.where) for f in verify_scene(scene)
-    }
+    assert ("schema", "note", "/views/a/novelty") in {(f.check, f.importance, f.where) for f in verify_scene(scene)}
 
 
 def test_a_newer_major_version_is_refused_with_what_to_do(scene: Path) -> None:

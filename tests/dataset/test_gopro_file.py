@@ -1,0 +1,318 @@
+"""GoPro clips: the real one's known answers, emulated ones against their truth, and hostile ones."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+from gopro_clips import clip, grey
+
+from spikerig.dataset import cli
+from spikerig.dataset.errors import DataError, RigError, UsageError
+from spikerig.dataset.gopro_file import chapters, open_gopro
+from spikerig.dataset.gopro_pictures import read_pictures
+from spikerig.dataset.gopro_times import nearest
+from spikerig.dataset.gpmf import header, items, streams, value
+from spikerig.rigctl.sim.emulate.gpmf_write import box, item, nest
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    paths, take = clip(tmp_path_factory.mktemp("clip"), skipped=(50, 50, 130))
+    return paths[0], take
+
+
+@pytest.mark.real
+def test_the_real_clip_has_its_known_answers(shared_data, capsys):
+    path = shared_data("gopro/max-heromode.mp4")
+    assert cli.run(["data", "info", str(path), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["frames"], told["model"], told["firmware"]) == (315, "GoPro Max", "H19.03.01.30.00")
+    assert told["srot_ms"] == pytest.approx(20.6008, abs=1e-4)
+    assert told["fps"] == pytest.approx(30000 / 1001)
+    assert told["duration_s"] == pytest.approx(315 * 1001 / 30000)
+    exposure = told["exposure_s"]
+    assert 1 / 1670 < exposure["min"] < exposure["median"] < exposure["max"] < 1 / 990
+    assert {"ACCL", "GYRO", "SHUT", "ISOE", "CORI", "GPS5"} <= set(told["streams"])
+    assert told["streams"]["HUES"]["samples"] == 98  # as its TSMP says: a repeated key is a sample each
+
+
+@pytest.mark.real
+def test_the_real_clips_frames_lie_on_its_stamps(shared_data):
+    read = open_gopro(shared_data("gopro/max-heromode.mp4"))
+    assert read.time_source == "CORI"
+    assert read.start_ns[[0, 30, 60]].tolist() == [85_608_000, 1_086_608_000, 2_087_608_000]
+    assert np.ptp(np.diff(read.start_ns)) <= 1
+    assert read.streams["ACCL"].values.mean(0) == pytest.approx([0, -9.8, 0], abs=3)
+    assert read.row_ns == pytest.approx(20.600767e6 / 480)
+
+
+@pytest.mark.real
+def test_pictures_by_number_are_those_of_reading_them_all(shared_data):
+    read = open_gopro(shared_data("gopro/max-heromode.mp4"))
+    whole = dict(read_pictures(read, range(120)))
+    for number, frame in read_pictures(read, [119, 3, 77, 3]):
+        assert np.array_equal(frame.pixels, whole[number].pixels)
+        assert frame.start_ns == read.start_ns[number]
+        assert frame.exposure_ns == read.exposure_ns[number]
+    last = [n for n, _ in read_pictures(read, [0, 314])]
+    assert last == [0, 314]
+
+
+def test_an_emulated_clips_times_are_the_true_ones_on_its_clock(plain):
+    path, take = plain
+    read = open_gopro(path)
+    assert read.frames == 150
+    error = read.start_ns - take.media_ns[:150]
+    assert np.abs(error).max() <= 1000  # stamps count microseconds
+    steps = np.rint(np.diff(read.start_ns) / np.median(np.diff(read.start_ns)))
+    assert np.flatnonzero(steps != 1).tolist() == [49, 129]
+    assert steps[49] == 3
+    assert np.flatnonzero(read.skipped).tolist() == [50, 130]
+    assert read.skipped[50] == 2
+    assert any("skipped" in r for r in read.remarks)
+    assert read.exposure_ns.tolist() == [2083333] * 150
+    assert (read.model, read.settings["EISE"], read.settings["VFPS"]) == ("HERO9 Black", "N", [120000, 1001])
+
+
+def test_pictures_show_what_was_there_at_their_time(plain):
+    path, take = plain
+    read = open_gopro(path)
+    for number, frame in read_pictures(read, read.frames_between(read.start_ns[60], read.start_ns[70])):
+        assert 60 <= number < 70
+        assert abs(frame.pixels.mean() - grey(int(take.true_starts_ns[number]))) < 3
+
+
+def test_each_frame_has_its_own_exposure(tmp_path):
+    told = np.linspace(1 / 2000, 1 / 240, 150)
+    paths, _ = clip(tmp_path, exposure_s=told)
+    assert open_gopro(paths[0]).exposure_ns / 1e9 == pytest.approx(told, rel=1e-6)
+
+
+def test_chapters_are_joined_without_a_seam(tmp_path):
+    paths, take = clip(tmp_path, frames=160, chapter_bytes=6_000)
+    assert len(paths) >= 2
+    assert chapters(paths[-1]) == paths
+    read = open_gopro(chapters(paths[0]))
+    assert (read.frames, len(read.chapter_frames)) == (160, len(paths))
+    assert np.abs(read.start_ns - take.media_ns[:160]).max() <= 1000
+    at = read.chapter_frames[0]
+    for number, frame in read_pictures(read, range(at - 2, at + 2)):
+        assert abs(frame.pixels.mean() - grey(int(take.true_starts_ns[number]))) < 3
+    if len(paths) > 2:
+        paths[1].unlink()
+        with pytest.raises(DataError, match="chapter of the clip is missing"):
+            chapters(paths[0])
+
+
+def test_chapters_of_other_clips_are_refused(tmp_path):
+    (tmp_path / "b").mkdir()
+    one, _ = clip(tmp_path)
+    other, _ = clip(tmp_path / "b", header={"CASN": "another"})
+    with pytest.raises(DataError, match="different clips"):
+        open_gopro([*one, *other])
+
+
+def test_chapters_whose_stamps_begin_anew_follow_each_other(tmp_path):
+    (tmp_path / "b").mkdir()
+    one, _ = clip(tmp_path, frames=30)
+    two, _ = clip(tmp_path / "b", frames=30)
+    read = open_gopro([*one, *two])
+    assert np.diff(read.start_ns) == pytest.approx(np.full(59, 1001e9 / 120e3), abs=1001)
+    assert any("begin anew" in r for r in read.remarks)
+    assert read.frames == 60
+
+
+def test_a_clip_without_telemetry_has_the_videos_grid(tmp_path, plain):
+    raw = plain[0].read_bytes().replace(b"gpmd", b"xxxx")
+    path = tmp_path / "a.mp4"
+    path.write_bytes(raw)
+    read = open_gopro(path)
+    assert (read.time_source, read.exposure_ns, read.streams) == ("pts", None, {})
+    assert read.start_ns[[0, 120]].tolist() == [0, 1_001_000_000]
+
+
+def test_frames_and_numbers_out_of_the_clip(plain):
+    read = open_gopro(plain[0])
+    with pytest.raises(UsageError):
+        list(read_pictures(read, [150]))
+    with pytest.raises(UsageError):
+        open_gopro([])
+    with pytest.raises(UsageError):
+        open_gopro(plain[0].with_name("none.mp4"))
+
+
+# ---- hostile files --------------------------------------------------------------------------------------------------
+
+
+def spoiled(raw, kind, change):
+    """A copy with `change(bytearray, place of the payload)` made in the last box of a kind."""
+    out = bytearray(raw)
+    change(out, out.rfind(kind) + 4)
+    return bytes(out)
+
+
+def number(offset, n, size=4):
+    def change(out, at):
+        out[at + offset : at + offset + size] = n.to_bytes(size, "big")
+
+    return change
+
+
+HOSTILE = {
+    "empty": lambda raw: b"",
+    "cut in the pictures": lambda raw: raw[: len(raw) // 2],
+    "cut in moov": lambda raw: raw[:-100],
+    "moov missing": lambda raw: raw.replace(b"moov", b"free"),
+    "not an mp4": lambda raw: b"\x89PNG" * 100,
+    "box of 0 bytes in moov": lambda raw: spoiled(raw, b"mdhd", number(-8, 0)),
+    "box of 4 bytes": lambda raw: spoiled(raw, b"mdhd", number(-8, 4)),
+    "box larger than its parent": lambda raw: spoiled(raw, b"stbl", number(-8, 1 << 31)),
+    "long box of 2^63 bytes": lambda raw: struct.pack(">I4sQ", 1, b"ftyp", 1 << 63) + raw,
+    "moov of 3 GB": lambda raw: struct.pack(">I4s", 3 << 30, b"moov") + raw,
+    "two moov": lambda raw: raw + raw[raw.rfind(b"moov") - 4 :],
+    "2^32 samples": lambda raw: spoiled(raw, b"stsz", number(8, 0xFFFFFFFF)),
+    "2^32 samples of 1 byte": lambda raw: spoiled(spoiled(raw, b"stsz", number(8, 0xFFFFFFFF)), b"stsz", number(4, 1)),
+    "2^31 samples in a run": lambda raw: spoiled(raw, b"stts", number(8, 1 << 31)),
+    "runs of another count": lambda raw: spoiled(raw, b"stts", number(8, 3)),
+    "no such chunk": lambda raw: spoiled(raw, b"stsc", number(8, 7)),
+    "chunks of 2^31": lambda raw: spoiled(raw, b"stsc", number(12, 1 << 31)),
+    "offset beyond the end": lambda raw: spoiled(raw, b"co64", number(8, 1 << 40, 8)),
+    "offset of 2^64 - 1": lambda raw: spoiled(raw, b"co64", number(8, 2**64 - 1, 8)),
+    "timescale 0": lambda raw: spoiled(raw, b"mdhd", number(12, 0)),
+    "nested 10,000 deep": lambda raw: raw[: raw.rfind(b"moov") - 4] + deep(10_000),
+    "100,000 tiny boxes": lambda raw: raw[: raw.rfind(b"moov") - 4] + box("moov", box("free") * 100_000),
+    "no video": lambda raw: raw.replace(b"vide", b"vidx"),
+    "telemetry claims too much": lambda raw: raw.replace(b"SHUTf\x04\x00", b"SHUTf\x04\xff", 1),
+    "telemetry of odd size": lambda raw: raw.replace(b"SHUTf\x04", b"SHUTf\x03", 1),
+    "exposure NaN": lambda raw: raw.replace(struct.pack(">f", 1 / 480), b"\x7f\xc0\0\0", 1),
+    "exposure negative": lambda raw: raw.replace(struct.pack(">f", 1 / 480), b"\xbf\x80\0\0", 1),
+    "read-out NaN": lambda raw: raw.replace(b"SROTf\x04\x00\x01\x40\xe0", b"SROTf\x04\x00\x01\x7f\xc0"),
+    "read-out as text": lambda raw: raw.replace(b"SROTf\x04\x00\x01", b"SROTc\x04\x00\x01"),
+    "scale 0": lambda raw: raw.replace(b"SCALs\x02\x00\x01\x7f\xff", b"SCALs\x02\x00\x01\x00\x00"),
+    "stamp of a million years": lambda raw: raw.replace(b"STMPJ\x08\x00\x01\0\0", b"STMPJ\x08\x00\x01\x7f\xff"),
+    "stamps that step back": lambda raw: raw.replace(struct.pack(">Q", 85_608), struct.pack(">Q", 9_085_608)),
+}  # fmt: skip
+
+
+def deep(levels):
+    out = b""
+    for _ in range(levels):
+        out = box("udta", out)
+    return box("moov", out)
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_file_is_one_clear_error(name, plain, tmp_path):
+    raw = plain[0].read_bytes()
+    bad = HOSTILE[name](raw)
+    assert bad != raw
+    path = tmp_path / "bad.mp4"
+    path.write_bytes(bad)
+    with pytest.raises(DataError) as told:
+        open_gopro(path)
+    assert "bad.mp4" in str(told.value)
+    assert told.value.cause
+
+
+def test_zero_box_at_the_end_of_the_file_is_allowed(plain, tmp_path):
+    path = tmp_path / "a.mp4"
+    path.write_bytes(plain[0].read_bytes() + struct.pack(">I4s", 0, b"free") + bytes(20))
+    assert open_gopro(path).frames == 150
+
+
+def fuzz(raw, path, rounds, seed):
+    """Flip bytes of moov and of the telemetry; whatever comes is a RigError or a clip."""
+    rng = np.random.default_rng(seed)
+    moov = raw.rfind(b"moov")
+    good = 0
+    for _ in range(rounds):
+        out = bytearray(raw)
+        span = (moov, len(raw)) if rng.random() < 0.7 else (max(raw.find(b"DEVC") - 100, 0), moov)
+        for at in rng.integers(*span, size=rng.integers(1, 6)):
+            out[at] = rng.choice([0, 1, 0x7F, 0x80, 0xFF, rng.integers(256)])
+        path.write_bytes(out)
+        try:
+            read = open_gopro(path)
+            assert np.all(np.diff(read.start_ns) >= 0)
+            good += 1
+        except RigError:
+            pass
+    return good
+
+
+def test_flipped_bytes_never_bring_a_traceback(plain, tmp_path):
+    good = fuzz(plain[0].read_bytes(), tmp_path / "fuzz.mp4", 400, 1)
+    assert 0 < good < 400
+
+
+@pytest.mark.real
+def test_flipped_bytes_of_the_real_clip_never_bring_a_traceback(shared_data, tmp_path):
+    raw = shared_data("gopro/max-heromode.mp4").read_bytes()
+    good = fuzz(raw, tmp_path / "fuzz.mp4", 120, 2)
+    assert 0 < good < 120
+
+
+def test_flipped_bytes_in_the_pictures_are_a_data_error_or_a_picture(plain, tmp_path):
+    raw, rng, path = plain[0].read_bytes(), np.random.default_rng(5), tmp_path / "fuzz.mp4"
+    for _ in range(20):
+        out = bytearray(raw)
+        for at in rng.integers(40, raw.find(b"DEVC") - 8, size=20):
+            out[at] = rng.integers(256)
+        path.write_bytes(out)
+        try:
+            told = len(list(read_pictures(open_gopro(path), range(0, 150, 10))))
+        except DataError as error:
+            told = str(error)
+        assert told == 15 or "fuzz.mp4" in str(told)
+
+
+def test_data_info_of_a_hostile_file_is_exit_4(tmp_path, capsys):
+    path = tmp_path / "bad.mp4"
+    path.write_bytes(b"nothing at all in here")
+    assert cli.run(["data", "info", str(path), "--json"]) == 4
+    assert json.loads(capsys.readouterr().out)["error"]["type"] == "DataError"
+
+
+# ---- GPMF by itself -------------------------------------------------------------------------------------------------
+
+
+def test_items_of_all_types_come_back():
+    told = {i.key: value(i) for i in items(
+        item("AAAA", "c", "hello") + item("BBBB", "L", [1, 2**32 - 1]) + item("CCCC", "s", -3)
+        + item("DDDD", "f", [[1.5, 2.5], [3, 4]]) + item("EEEE", "J", 2**50) + item("FFFF", "F", "GPRO") + bytes(8)
+    )}  # fmt: skip
+    assert told == {
+        "AAAA": "hello", "BBBB": [1, 2**32 - 1], "CCCC": -3, "DDDD": [[1.5, 2.5], [3.0, 4.0]], "EEEE": 2**50,
+        "FFFF": "GPRO",
+    }  # fmt: skip
+
+
+def test_a_complex_sample_is_read_by_its_types():
+    raw = struct.pack(">Lf", 7, 0.5) * 3
+    inside = item("TYPE", "c", "Lf") + item("SCAL", "s", [[1], [2]])[:-4] + struct.pack(">hh", 1, 2)
+    data = struct.pack(">4sBBH", b"ABCD", ord("?"), 8, 3) + raw
+    (found,) = streams(nest("DEVC", item("DVID", "L", 1), nest("STRM", inside, data)))
+    assert found.values.tolist() == [[7.0, 0.25]] * 3
+
+
+@pytest.mark.parametrize("kinds", ["f[999999999]", "f[x]", "[3]", "f[" + "9" * 300])
+def test_a_type_that_swells_is_refused(kinds):
+    data = struct.pack(">4sBBH", b"ABCD", ord("?"), 4, 1) + bytes(4)
+    with pytest.raises(DataError):
+        streams(nest("DEVC", nest("STRM", item("TYPE", "c", kinds), data)))
+
+
+def test_the_header_is_by_device():
+    data = nest("DEVC", item("DVID", "L", 1), item("MINF", "c", "HERO9 Black")) + nest(
+        "DEVC", item("DVID", "F", "FOVL")
+    )
+    assert header(data + bytes(100)) == {"1": {"DVID": 1, "MINF": "HERO9 Black"}, "FOVL": {"DVID": "FOVL"}}
+
+
+def test_nearest_is_the_brute_force():
+    rng = np.random.default_rng(0)
+    at, wanted = np.sort(rng.integers(0, 1000, 40)), rng.integers(-50, 1050, 200)
+    near = nearest(at, wanted)
+    assert np.array_equal(np.abs(at[near] - wanted), np.abs(at[:, None] - wanted).min(0))
+    assert nearest(np.array([5]), wanted).tolist() == [0] * 200
