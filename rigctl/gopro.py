@@ -214,7 +214,7 @@ class GoProSource:
             self.radio.close()
 
 
-def connect(
+def open_gopro(
     host: Host, *, link: str = "ble", name: str = "", address: str = ADDRESS,
     say: Callable[[str], None] = lambda text: None,
 ) -> GoProSource:  # fmt: skip

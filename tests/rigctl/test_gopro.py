@@ -11,7 +11,8 @@ from spikerig.dataset.errors import DeviceError, HostError, UsageError
 from spikerig.dataset.gopro_file import open_gopro
 from spikerig.dataset.gopro_pictures import read_pictures
 from spikerig.rigctl import gopro_ble as ble
-from spikerig.rigctl.gopro import GoProSource, connect, find
+from spikerig.rigctl.gopro import GoProSource, find
+from spikerig.rigctl.gopro import open_gopro as open_camera
 from spikerig.rigctl.gopro_check import verify_clip
 from spikerig.rigctl.gopro_http import Dark, Web
 from spikerig.rigctl.gopro_radio import Radio
@@ -368,11 +369,11 @@ def test_it_is_found_one_way_or_another_or_the_reasons_are_told(tmp_path, faults
 def test_a_real_camera_is_connected_to_by_ble_or_by_hand(monkeypatch):
     monkeypatch.setitem(sys.modules, "bleak", None)
     with pytest.raises(HostError, match="bleak"):
-        connect(RealHost())
+        open_camera(RealHost())
     with pytest.raises(UsageError):
-        connect(RealHost(), link="usb")
+        open_camera(RealHost(), link="usb")
     with pytest.raises(Dark):
-        connect(RealHost(), link="hand", address="127.0.0.1:9")
+        open_camera(RealHost(), link="hand", address="127.0.0.1:9")
 
 
 # ---- without Bluetooth ----------------------------------------------------------------------------------------------
