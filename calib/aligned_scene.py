@@ -17,7 +17,6 @@ from spikerig.calib.align import (
     Warp,
     coded_like,
     linear_of,
-    own_rows,
     pair,
     rows_of_spike_px,
     warp_light,
@@ -197,10 +196,8 @@ def same_camera(scene: SceneFile, warp: Warp) -> bool:
 
 def _aligned_view(view: View, warp: Warp) -> View:
     light = np.where(warp.valid[..., None], warp_light(warp, linear_of(view.frame)), 0)
-    nothing = Texture(np.zeros(warp.valid.shape, np.float32), np.zeros(warp.valid.shape, bool), 0.0, "none")
     frame = replace(view.frame, pixels=coded_like(view.frame, light))
-    told = Aligned(warp.camera, light, nothing, warp.sensor_row, warp.valid, frame)
-    frame, rows = own_rows(told, view.frame.pixels.shape[0])
+    rows = np.where(warp.valid, warp.sensor_row, 0)
     return replace(view, frame=frame, sensor_row=rows, valid=warp.valid)
 
 

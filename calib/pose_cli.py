@@ -105,6 +105,7 @@ def _scene(
 
     from spikerig.calib.posed_scene import write_poses
     from spikerig.calib.poses import estimate_poses
+    from spikerig.calib.straight import straight_of
     from spikerig.dataset.provenance import origin_of
     from spikerig.dataset.store import open_scene
 
@@ -113,7 +114,10 @@ def _scene(
         views = [v for v in views if v.spikes is not None or (wanted.arms == "rgb" and v.split == "train")]
         bar = Progress("mapping", 0, "steps")
         keep = None if out is None else out / "colmap"
-        estimate = estimate_poses(views, scene.camera, wanted, options, keep=keep, done=lambda step: bar.step(1, step))
+        estimate = estimate_poses(
+            views, scene.camera, wanted, options, straight=straight_of(scene), keep=keep,
+            done=lambda step: bar.step(1, step),
+        )  # fmt: skip
         known = {v.name: v.pose.cam_from_world for v in views}
         origin = origin_of(scene, "h5py")
         simulated = scene.has_truth and "poses" not in scene.info

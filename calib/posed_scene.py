@@ -118,7 +118,7 @@ def trajectory_of(view: View, estimate: Estimate, to: Similarity) -> Trajectory 
     path = estimate.paths.get(view.name)
     if path is None:
         return None
-    start = view.frame.mid_ns - view.frame.exposure_ns // 2
+    start = view.mid_ns - view.frame.exposure_ns // 2
     at = start + np.rint(path.phases * view.frame.exposure_ns).astype(np.int64)
     cov = np.array(path.cov)
     cov[:, 3:, :] *= to.scale

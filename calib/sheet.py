@@ -51,7 +51,7 @@ def sharp_textures(view: View, calibration: RigCalibration, warp: Warp) -> dict[
     if view.spikes is None:
         return {}
     rows = rows_of_spike_px(calibration)
-    at = float(np.clip(view.spikes.tick_at(view.frame.mid_ns), 0, view.spikes.ticks))
+    at = float(np.clip(view.spikes.tick_at(view.mid_ns), 0, view.spikes.ticks))
     made = {"TFP, 32 ticks": tfp_rows(view.spikes, view.frame, rows, 0.5, 32), "TFI": tfi(view.spikes, at)}
     return {name: warp_texture(warp, texture).light for name, texture in made.items()}
 

@@ -13,6 +13,7 @@ from hard_sim import small
 from spikerig.calib.bundle import turn
 from spikerig.calib.rig import write_calibration
 from spikerig.dataset import cli
+from spikerig.dataset.flat import FlatField, write_flat
 from spikerig.dataset.scene import Pose
 from spikerig.dataset.store import open_scene, verify_scene
 from spikerig.rigctl.sim.capture import capture
@@ -140,3 +141,29 @@ def test_what_cannot_be_aligned(takes: Path, tmp_path: Path, capsys: pytest.Capt
     assert code == 0
     assert told["written"] is None
     assert told["valid"] < 0.92
+
+
+def test_textures_are_evened_out_on_request(takes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(3)
+    ones = np.ones((100, 160), np.float32)
+    rough = np.where(rng.random(ones.shape) < 0.5, 0.4, 1.6).astype(np.float32)
+    for name, gain in (("even", ones), ("rough", rough)):
+        write_flat(tmp_path / f"{name}.npz", FlatField(gain, 0 * ones, ones > 0, ones))
+    words = (takes / "raw.h5", "--with", takes / "calib.json")
+    score = {}
+    for name in ("even", "rough"):
+        code, told = run(capsys, *words, "--check", "--flat", tmp_path / f"{name}.npz", "--force")
+        assert code == 0
+        score[name] = told["edges_px"]["median"]
+    assert score["even"] == run(capsys, *words, "--check")[1]["edges_px"]["median"]
+    assert score["rough"] is None or score["rough"] > score["even"]  # a wrong map spoils the edges: it was used
+    code, told = run(capsys, *words, "-o", tmp_path / "out.h5", "--flat", tmp_path / "even.npz")
+    assert code == 0
+    with open_scene(tmp_path / "out.h5") as scene:
+        assert scene.info["align"]["files"]["flat"]["name"] == "even.npz"
+        assert len(scene.info["align"]["files"]["flat"]["sha256"]) == 64
+    small = FlatField(*(a[:50] for a in (ones, ones, ones > 0, ones)))
+    write_flat(tmp_path / "small.npz", small)
+    code, told = run(capsys, *words, "--check", "--flat", tmp_path / "small.npz")
+    assert code == 2
+    assert "another sensor" in told["error"]["what"]
