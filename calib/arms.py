@@ -56,7 +56,9 @@ class Arms:
 
     def tfi(self) -> Texture:
         """TFI at mid-exposure of the middle row."""
-        at = float(np.clip(self.stream.tick_at(self.frame.mid_ns), 0, self.stream.ticks))
+        row = float(np.median(self.rows[len(self.rows) // 2]))
+        mid_ns = self.frame.start_ns + self.frame.exposure_ns // 2 + round(self.frame.row_ns * row)
+        at = float(np.clip(self.stream.tick_at(mid_ns), 0, self.stream.ticks))
         return self._seen(tfi(self.stream, at))
 
     def aligned(self, valid: NDArray[np.bool_]) -> Aligned:

@@ -169,8 +169,8 @@ docs/demo400.toml --views 50`; 2 cores of an AMD EPYC, AVX-512, commit 6dee168).
 
 `frames-are-in-step` measures: it makes the exposure's blur of the spikes at 13 lags and asks which fits the picture
 best. In that scene it finds 0.01 ticks, with a standard deviation of 0.03, where the truth is 0. A shift of all
-pictures against the spikes is fitted beside the lag, so that a misaligned rig does not look late where views move in different
-ways. The standard deviation is that of leaving out each view in turn.
+pictures against the spikes is fitted beside the lag, so that a misaligned rig does not look late where views move in
+different ways. The standard deviation is that of leaving out each view in turn.
 
 {table}
 The document of `--json` has `checks` (each with `status`, `seconds`, and by view why it was undecided) and `findings`

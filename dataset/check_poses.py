@@ -211,7 +211,7 @@ def _path(look: ViewLook) -> Path:
     path, frame = look.view.trajectory, look.frame
     if path is None:
         raise Undecided("no path")
-    return Path(look.view.pose, path, frame.mid_ns - frame.exposure_ns // 2, frame.exposure_ns)
+    return Path(look.view.pose, path, look.view.mid_ns - frame.exposure_ns // 2, frame.exposure_ns)
 
 
 @check(
