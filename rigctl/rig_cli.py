@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from spikerig.dataset.clocktime import NS
-from spikerig.dataset.errors import DataError, RigError, UsageError
+from spikerig.dataset.errors import DataError, DeviceError, RigError, UsageError
 from spikerig.dataset.terminal import emit, note
 from spikerig.rigctl.devices import DeviceFacts
 from spikerig.rigctl.host import RealHost
@@ -123,7 +123,7 @@ def _from_camera(bench: Any, profile: Any, serial: str, size: int) -> tuple[Any,
     from spikerig.rigctl.vidar import VidarSource
 
     host = bench.host if bench else RealHost()
-    source = VidarSource(profile, host, bench.usb if bench else None, serial=serial)
+    source = VidarSource(profile, host, bench.usb if bench else None, serial=serial, patience_ns=10 * NS)
     try:
         source.start()
         kept: list[Any] = []
@@ -144,7 +144,7 @@ def _from_camera(bench: Any, profile: Any, serial: str, size: int) -> tuple[Any,
         source.close()
     data = np.concatenate(kept)[:size] if kept else np.zeros(0, np.uint8)
     if not len(data):
-        raise DataError("no bytes came", value=f"{source.facts.serial} at {source.facts.address}")
+        raise DeviceError("no bytes came", value=f"{source.facts.serial} at {source.facts.address}")
     return data, rate.bytes_s if rate else None
 
 
