@@ -1,0 +1,58 @@
+"""Opening the rig that a plan asks for: real devices, or an emulated rig."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from spikerig.dataset.rawtake import read_lines
+from spikerig.rigctl.host import RealHost
+from spikerig.rigctl.record import Rig
+from spikerig.rigctl.take_plan import TakePlan
+
+
+def open_rig(plan: TakePlan, emulate: str = "", resumed: Path | None = None) -> Rig:
+    """The devices of a plan, open.
+
+    Args:
+        plan: names them.
+        emulate: file or name of an emulated rig; empty: the real one.
+        resumed: folder of a take that is gone on with: emulated time goes on after it.
+
+    Raises:
+        UsageError, DeviceError, HostError: a device is not there, is held by others, or is not what the plan says.
+    """
+    if emulate:
+        from spikerig.rigctl.sim.emulate.rig import load_rig_spec, open_emulated
+
+        return open_emulated(load_rig_spec(emulate), plan, after_ns=_last_ns(resumed))
+    return _real(plan)
+
+
+def _real(plan: TakePlan) -> Rig:
+    from spikerig.rigctl.syncbox import HarpBox, find_port, serial_opener
+    from spikerig.rigctl.vidar import VidarSource
+
+    host = RealHost()
+    spike = VidarSource(plan.profile, host, serial=plan.spike.serial)
+    try:
+        box = None
+        if plan.sync.mode == "box":
+            port = plan.sync.port or find_port(host)
+            box = HarpBox(serial_opener(port), host, address=port)
+        rgb = None
+        if plan.rgb.use:
+            from spikerig.rigctl.gopro import open_gopro
+
+            rgb = open_gopro(host)
+    except BaseException:
+        spike.close()
+        raise
+    return Rig(host, spike, rgb, box)
+
+
+def _last_ns(take: Path | None) -> int:
+    """The newest host time in a take's views and log; 0 without any."""
+    if take is None:
+        return 0
+    lines = [told for name in ("views.jsonl", "log.jsonl") for _, told in read_lines(take / name)]
+    return max((int(t.get("stop_ns") or t.get("host_ns") or 0) for t in lines), default=0)
