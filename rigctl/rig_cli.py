@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -82,7 +82,8 @@ def probe(
         if file is not None:
             data, bytes_s = _from_file(file, size), None
         else:
-            refuse_existing(out, force)
+            if out is not None:
+                refuse_existing(out, force)
             data, bytes_s = _from_camera(bench, chosen, serial, size)
     if out is not None:
         with whole_file(out, force=force) as part:
@@ -165,8 +166,11 @@ def bench_of(emulate: str) -> Iterator[Any]:
         return
     from spikerig.rigctl.sim.emulate.rig import load_rig_spec, transports_of
 
-    with tempfile.TemporaryDirectory(prefix="spikerig-card-") as card:
-        yield transports_of(load_rig_spec(emulate), Path(card))
+    bench = transports_of(load_rig_spec(emulate))
+    try:
+        yield bench
+    finally:
+        shutil.rmtree(bench.card, ignore_errors=True)
 
 
 def _spike(bench: Any) -> Found:

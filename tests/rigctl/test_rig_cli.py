@@ -45,6 +45,15 @@ def test_find_tells_what_is_there_and_why_not(spec, capsys, monkeypatch):
     assert "udevadm" in doc["kinds"]["spike"]["reasons"][0]
 
 
+def test_find_sees_all_three_kinds_of_the_shipped_rig(capsys):
+    code, doc = told(capsys, "rig", "find", "--emulate", "demo")
+    assert (code, doc["missing"], doc["emulated"]) == (0, [], True)
+    models = {kind: found["devices"][0]["model"] for kind, found in doc["kinds"].items()}
+    assert models["spike"] == "FT601"
+    assert models["rgb"].startswith("HERO9")
+    assert models["sync"].startswith("harp")
+
+
 def test_find_without_libusb_goes_on_with_the_other_kinds(capsys, monkeypatch):
     monkeypatch.setattr(usbport, "_load", lambda: None)
     monkeypatch.setattr(
@@ -133,4 +142,4 @@ def test_a_camera_that_says_nothing_is_told(tmp_path, capsys):
     assert code == 3
     assert "says nothing" in doc["error"]["what"]
     spec.write_text("[spike\n")
-    assert told(capsys, "rig", "probe", "--emulate", str(spec))[0] == 4
+    assert told(capsys, "rig", "probe", "--emulate", str(spec))[0] == 2

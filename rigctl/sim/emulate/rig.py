@@ -144,6 +144,7 @@ class Transports:
         web, radio: to the GoPro.
         ports: serial ports as `syncbox.find` takes them.
         opener_of: of a port.
+        card: folder that stands for the RGB camera's card; whoever asked for it removes it.
     """
 
     host: VirtualHost
@@ -153,26 +154,37 @@ class Transports:
     radio: Radio
     ports: tuple[tuple[str, str], ...]
     opener_of: Callable[[str], Any]
+    card: Path
 
 
-def transports_of(spec: RigSpec, card: Path) -> Transports:
+def transports_of(spec: RigSpec) -> Transports:
     """The devices of a spec with nobody driving them; the spike camera sees a looped texture.
 
     Args:
         spec: the rig; `spike` may name a wire profile.
-        card: folder that stands for the RGB camera's card.
 
     Raises:
         UsageError: keys or values that are wrong.
     """
     host = VirtualHost(round(spec.start_s * NS))
     bridge = bridge_of({"seed": spec.seed, **spec.spike}, host.now_ns(), where="spike")
-    camera, box = _camera(spec, host, lambda *_: None, card), _box(spec, host)
+    camera, box = _camera(spec, host, _nothing), _box(spec, host)
     web, radio = Web(AirWifi(WebServer(camera)), host), Radio(Air(camera).dial, host)
     ports = (("emulated", "emulated"),)
     return Transports(
-        host, EmulatedUsb(host, [bridge]), bridge.wire.profile, web, radio, ports, lambda _: device_errors(box.port)
+        host,
+        EmulatedUsb(host, [bridge]),
+        bridge.wire.profile,
+        web,
+        radio,
+        ports,
+        lambda _: device_errors(box.port),
+        camera.card,
     )
+
+
+def _nothing(*_: Any) -> Any:
+    raise UsageError("an emulated rig without a scene records no pictures")
 
 
 def _camera(spec: RigSpec, host: VirtualHost, pictures: Any) -> GoProCamera:
