@@ -110,9 +110,9 @@ def run(argv: list[str]) -> int:
         wrong = UsageError(what, next=f"spikerig {' '.join(_verbs(argv))} --help".replace("  ", " "))
         return _tell(wrong.as_json(), str(wrong), 2, as_json)
     except typer.Exit as leave:
-        return leave.exit_code
+        return _interrupted(as_json) if leave.exit_code == 130 else leave.exit_code  # typer's own way to say so
     except (KeyboardInterrupt, typer.Abort):
-        return _tell({"type": "Interrupted", "exit_code": 130, "what": "interrupted"}, "interrupted", 130, as_json)
+        return _interrupted(as_json)
     except BrokenPipeError:  # `spikerig ... | head`
         sys.stderr.close()
         return 0
@@ -137,6 +137,10 @@ def _tell(record: dict[str, object], text: str, code: int, as_json: bool) -> int
         emit("spikerig.error/1", {"error": record})
     note("error: " + text)
     return code
+
+
+def _interrupted(as_json: bool) -> int:
+    return _tell({"type": "Interrupted", "exit_code": 130, "what": "interrupted"}, "interrupted", 130, as_json)
 
 
 def _bug(error: Exception, argv: list[str], as_json: bool) -> int:
