@@ -91,7 +91,7 @@ def ingest(
     truth = read_truth(take)
     times = Times(take, truth)
     wire = WireBytes(take)
-    framing = Framing(wire)
+    framing = Framing(wire, [s for v in views for s in v.spikes])
     wanted = bool(truth) if config.truth is None else config.truth
     world = TrueWorld(take, times, truth) if wanted else None
     size = take.profile
@@ -168,7 +168,7 @@ def cut_view(
     rgb = times.rgb(clip, view.clips[0], int(view.clip["start_ns"][0])).model
     epoch, start, stop = max(view.spikes, key=lambda s: s[2] - s[1])
     profile = take.profile
-    offset = framing.offset(epoch, start, stop)
+    offset = framing.offset(epoch)
     first = -(-(start - offset) // profile.tick_bytes)
     last = (stop - offset) // profile.tick_bytes
     spike = times.spike(epoch, device_ns(profile, start))

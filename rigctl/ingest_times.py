@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +21,7 @@ from spikerig.dataset.marks import Sight, read_marks
 from spikerig.dataset.rawtake import RawTake, WireBytes
 
 LATE_TICKS = 1  # a tick's bytes leave during the tick after it was exposed (assumed: docs/hardware/vidar.md)
-SURE = 0.9  # a framing that is less likely is not believed
+SURE, VERY_SURE = 0.9, 0.999  # a framing that is less likely is not believed; one that is more ends the search
 PHASE_TICKS = 512  # looked at for the framing
 
 
@@ -135,26 +135,41 @@ def read_truth(take: RawTake) -> list[Mapping[str, Any]]:
 
 
 class Framing:
-    """Where ticks begin in each epoch: found once, from the picture that the bits hold."""
+    """Where ticks begin in each epoch: found once, from the pictures that the bits hold.
 
-    def __init__(self, wire: WireBytes) -> None:
-        self.wire, self.profile = wire, wire.take.profile
+    Args:
+        wire: the bytes.
+        spans: (epoch, first byte, byte past the last) of viewpoints: one whose picture tells is enough.
+    """
+
+    def __init__(self, wire: WireBytes, spans: Iterable[tuple[int, int, int]]) -> None:
+        self.wire, self.profile, self.spans = wire, wire.take.profile, list(spans)
         self._offset: dict[int, int] = {}
 
-    def offset(self, epoch: int, start: int, stop: int) -> int:
-        """Byte in an epoch, modulo a tick, at which ticks begin; looked for in [start, stop).
+    def offset(self, epoch: int) -> int:
+        """Byte of an epoch, modulo a tick, at which ticks begin.
 
         Raises:
-            RefusedError: the picture does not tell.
+            RefusedError: no picture tells, or two that seem sure differ.
         """
         if epoch not in self._offset:
-            stop = min(stop, start + PHASE_TICKS * self.profile.tick_bytes)
-            data, missing = self.wire.read(epoch, start, stop)
-            phase = find_phase(data, self.profile)
-            if phase.confidence < SURE or missing:
+            best, sure = 0.0, set()
+            for _, start, stop in [s for s in self.spans if s[0] == epoch]:
+                stop = min(stop, start + PHASE_TICKS * self.profile.tick_bytes)
+                data, missing = self.wire.read(epoch, start, stop)
+                if missing or len(data) < 16 * self.profile.tick_bytes:
+                    continue
+                phase = find_phase(data, self.profile)
+                best = max(best, phase.confidence)
+                if phase.confidence >= SURE:
+                    sure.add((start + phase.offset) % self.profile.tick_bytes)
+                if len(sure) == 1 and phase.confidence > VERY_SURE:
+                    break
+            if len(sure) != 1:
                 raise RefusedError(
-                    "where ticks begin cannot be told", value=f"epoch {epoch}, confidence {phase.confidence:.2f}",
-                    cause="a dark, uniform or noisy picture", next="spikerig rig probe tests the wire profile",
+                    "where ticks begin cannot be told",
+                    value=f"epoch {epoch}, confidence {best:.2f}, {len(sure)} answers",
+                    cause="dark, uniform or noisy pictures", next="spikerig rig probe tests the wire profile",
                 )  # fmt: skip
-            self._offset[epoch] = (start + phase.offset) % self.profile.tick_bytes
+            self._offset[epoch] = sure.pop()
         return self._offset[epoch]

@@ -10,13 +10,14 @@ from spikerig.rigctl.record import Rig
 from spikerig.rigctl.take_plan import TakePlan
 
 
-def open_rig(plan: TakePlan, emulate: str = "", resumed: Path | None = None) -> Rig:
+def open_rig(plan: TakePlan, take: Path, emulate: str = "", resume: bool = False) -> Rig:
     """The devices of a plan, open.
 
     Args:
         plan: names them.
+        take: folder of the take; an emulated RGB camera's card is TAKE.card beside it.
         emulate: file or name of an emulated rig; empty: the real one.
-        resumed: folder of a take that is gone on with: emulated time goes on after it.
+        resume: the take is gone on with: emulated time goes on after it.
 
     Raises:
         UsageError, DeviceError, HostError: a device is not there, is held by others, or is not what the plan says.
@@ -24,7 +25,9 @@ def open_rig(plan: TakePlan, emulate: str = "", resumed: Path | None = None) -> 
     if emulate:
         from spikerig.rigctl.sim.emulate.rig import load_rig_spec, open_emulated
 
-        return open_emulated(load_rig_spec(emulate), plan, after_ns=_last_ns(resumed))
+        card = take.absolute().with_name(take.name + ".card")
+        after_ns = _last_ns(take) if resume else 0
+        return open_emulated(load_rig_spec(emulate), plan, card=card, after_ns=after_ns)
     return _real(plan)
 
 
@@ -50,9 +53,7 @@ def _real(plan: TakePlan) -> Rig:
     return Rig(host, spike, rgb, box)
 
 
-def _last_ns(take: Path | None) -> int:
+def _last_ns(take: Path) -> int:
     """The newest host time in a take's views and log; 0 without any."""
-    if take is None:
-        return 0
     lines = [told for name in ("views.jsonl", "log.jsonl") for _, told in read_lines(take / name)]
     return max((int(t.get("stop_ns") or t.get("host_ns") or 0) for t in lines), default=0)

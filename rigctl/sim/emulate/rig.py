@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from importlib.resources import files
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Any, TypeVar
 
 import numpy as np
@@ -90,12 +89,13 @@ def load_rig_spec(path: str | Path) -> RigSpec:
     return spec
 
 
-def open_emulated(spec: RigSpec, plan: TakePlan, *, after_ns: int = 0) -> Rig:
+def open_emulated(spec: RigSpec, plan: TakePlan, *, card: Path, after_ns: int = 0) -> Rig:
     """The rig of a spec, for a plan: its viewpoints, profile and sync mode.
 
     Args:
         spec: the rig.
         plan: what it is for.
+        card: folder that stands for the RGB camera's memory card.
         after_ns: host time of what was recorded before, for a take that is gone on with.
 
     Raises:
@@ -111,7 +111,7 @@ def open_emulated(spec: RigSpec, plan: TakePlan, *, after_ns: int = 0) -> Rig:
     bridge = bridge_of({"seed": spec.seed, **spec.spike, "profile": _wire_table(wire)}, start_ns, ticker, "spike")
     ticker.tick_ns = bridge.wire.tick_true_ns
     usb = EmulatedUsb(host, [bridge])
-    camera = _camera(spec, host, world.frame) if plan.rgb.use else None
+    camera = _camera(spec, host, world.frame, card) if plan.rgb.use else None
     box = _box(spec, host) if plan.sync.mode == "box" else None
     spike = VidarSource(wire, host, usb, serial=plan.spike.serial)
     rgb = None
@@ -132,12 +132,12 @@ def open_emulated(spec: RigSpec, plan: TakePlan, *, after_ns: int = 0) -> Rig:
     return Rig(host, spike, rgb, sync, world.place, truth)
 
 
-def _camera(spec: RigSpec, host: VirtualHost, pictures: Any) -> GoProCamera:
+def _camera(spec: RigSpec, host: VirtualHost, pictures: Any, card: Path) -> GoProCamera:
     table = dict(spec.rgb)
     nature = _of(Nature, table.pop("nature", {}), "rgb.nature")
     faults = _of(RgbFaults, table.pop("faults", {}), "rgb.faults")
     clock = _clock(table, spec.seed, "gopro", "rgb")
-    card = Path(mkdtemp(prefix="spikerig-card-"))
+    card.mkdir(parents=True, exist_ok=True)
     return GoProCamera(host, card, pictures, clock, nature, faults, spec.seed)
 
 
