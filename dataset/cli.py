@@ -99,6 +99,8 @@ def run(argv: list[str]) -> int:
     as_json = "--json" in argv
     try:
         result = assemble(argv)(args=argv, standalone_mode=False, prog_name="spikerig")
+        if result == 130:  # typer's own way to tell of an interrupt
+            return _interrupted(as_json)
         return result if isinstance(result, int) else 0
     except RigError as error:
         return _tell(error.as_json(), str(error), error.exit_code, as_json)
@@ -110,7 +112,7 @@ def run(argv: list[str]) -> int:
         wrong = UsageError(what, next=f"spikerig {' '.join(_verbs(argv))} --help".replace("  ", " "))
         return _tell(wrong.as_json(), str(wrong), 2, as_json)
     except typer.Exit as leave:
-        return _interrupted(as_json) if leave.exit_code == 130 else leave.exit_code  # typer's own way to say so
+        return leave.exit_code
     except (KeyboardInterrupt, typer.Abort):
         return _interrupted(as_json)
     except BrokenPipeError:  # `spikerig ... | head`
