@@ -27,7 +27,7 @@ class Options:
 
     Args:
         wander: what the clocks may do.
-        stamp_ns: count of the box's stamps, which are cut: 32,000 of Harp.
+        stamp_ns: step of the box's stamps: 32,000 of Harp.
         assumed_ns: what the floor latency of one-way stamps is believed to stay below where nothing proves it.
         origin_ns: rig time 0 on the rig's clock; None: the first mark on it.
     """

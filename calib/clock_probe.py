@@ -45,8 +45,8 @@ def gate(probes: Sequence[Probe], stamp_ns: int = 0) -> Gated:
 
     Args:
         probes: two-way ones (`sent_ns` is an int) of one clock.
-        stamp_ns: the device's stamp counts in steps of this (32,000 for Harp) and is cut, not rounded: half of it
-            is added, and its spread is part of the deviation.
+        stamp_ns: the device's stamp counts in steps of this (32,000 for Harp; the driver has added half a step):
+            the spread is part of the deviation.
 
     Raises:
         UsageError: a probe whose answer came before the question, or a one-way one.
@@ -68,7 +68,7 @@ def gate(probes: Sequence[Probe], stamp_ns: int = 0) -> Gated:
     sd = np.sqrt(LEAST_NS**2 + stamp_ns**2 / 12 + excess**2 / 12)
     weight = sd**-2
     bias = float((weight * least).sum() / (2 * weight.sum())) if len(kept) else 0.0
-    pairs = Pairs(middle, device[kept] + stamp_ns // 2, sd, excess[:, None] / 2, np.array([SHARE]))
+    pairs = Pairs(middle, device[kept], sd, excess[:, None] / 2, np.array([SHARE]))
     return Gated(pairs, delay[kept], bias, kept)
 
 

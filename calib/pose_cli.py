@@ -101,8 +101,12 @@ def _sheet(out: Path, writes: bool, force: bool) -> Any:
 def _scene(
     source: Path, out: Path | None, wanted: Any, options: Any, write: bool, write_to: Path | None, force: bool
 ) -> dict[str, Any]:
+    from dataclasses import asdict
+
     from spikerig.calib.posed_scene import write_poses
     from spikerig.calib.poses import estimate_poses
+    from spikerig.calib.straight import straight_of
+    from spikerig.dataset.provenance import origin_of
     from spikerig.dataset.store import open_scene
 
     with open_scene(source) as scene:
@@ -110,8 +114,12 @@ def _scene(
         views = [v for v in views if v.spikes is not None or (wanted.arms == "rgb" and v.split == "train")]
         bar = Progress("mapping", 0, "steps")
         keep = None if out is None else out / "colmap"
-        estimate = estimate_poses(views, scene.camera, wanted, options, keep=keep, done=lambda step: bar.step(1, step))
+        estimate = estimate_poses(
+            views, scene.camera, wanted, options, straight=straight_of(scene), keep=keep,
+            done=lambda step: bar.step(1, step),
+        )  # fmt: skip
         known = {v.name: v.pose.cam_from_world for v in views}
+        origin = origin_of(scene, "h5py")
         simulated = scene.has_truth and "poses" not in scene.info
     told = report(estimate, options)
     told["source"] = str(source)
@@ -119,7 +127,8 @@ def _scene(
     told["forced"] = bool(estimate.reasons) and force
     if (write or write_to) and (told["accepted"] or force):
         left_out = ("poses", "source", "seconds")
-        record = {k: v for k, v in told.items() if k not in left_out}
+        record = {k: v for k, v in told.items() if k not in left_out} | origin | {"wanted": asdict(wanted)}
+        record["versions"] |= told["versions"]
         told |= write_poses(source, estimate, record, out=write_to, force=force)
     return told
 

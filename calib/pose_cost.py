@@ -76,7 +76,7 @@ class Truth:
         found, true = [], []
         for name in names:
             view, path = next(v for v in self.views if v.name == name), self.paths[name]
-            ends = np.array([-0.5, 0.5]) * view.frame.exposure_ns + view.frame.mid_ns
+            ends = np.array([-0.5, 0.5]) * view.frame.exposure_ns + view.mid_ns
             true += [path.poses[int(np.argmin(np.abs(path.at_ns - t)))] for t in ends]
             got = estimate.paths.get(name)
             found += [estimate.poses[name]] * 2 if got is None else [got.poses[0], got.poses[-1]]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from spikerig.calib.gauge import Similarity, similarity
 from spikerig.calib.poses import Estimate
 from spikerig.dataset.errors import UsageError
+from spikerig.dataset.outfile import refuse_existing, stand_in
 from spikerig.dataset.scene import Points, Pose, Trajectory, View
 from spikerig.dataset.store import SceneFile, open_scene
 
@@ -61,34 +61,29 @@ def write_poses(
     from spikerig.dataset.store import SceneWriter
 
     target = out or path
-    with open_scene(path) as scene:
+    if out is not None:
+        refuse_existing(out, force)
+    with open_scene(path) as scene, stand_in(target, "poses") as beside:
         earlier = {n: scene.view(n, spikes=False).pose.cam_from_world for n in scene.names if n in estimate.images}
         to = onto(estimate, earlier)
         placed = dict(zip(estimate.poses, to.poses(np.stack(list(estimate.poses.values()))), strict=True))
         left_out = sorted(set(estimate.images) - placed.keys())
-        beside = target.with_name(f".{target.stem}.poses.{os.getpid()}{target.suffix}")
-        if out is not None and out.exists() and not force:
-            raise UsageError("the file exists already", value=out, next="give --force to replace it")
-        try:
-            with SceneWriter(
-                beside,
-                scene.name,
-                scene.camera,
-                light_gain=scene.light_gain,
-                info={**scene.info, "poses": dict(provenance)},
-                points=_points(estimate, to) or scene.points,
-                clock=scene.clock,
-                calibration=scene.calibration,
-                truth=scene.truth,
-                keep=False,
-            ) as writer:
-                for name in scene.names:
-                    if name not in left_out:
-                        _copy(scene, writer, name, placed, estimate, to)
-                    done()
-            os.replace(beside, target)
-        finally:
-            beside.unlink(missing_ok=True)
+        with SceneWriter(
+            beside,
+            scene.name,
+            scene.camera,
+            light_gain=scene.light_gain,
+            info={**scene.info, "poses": dict(provenance)},
+            points=_points(estimate, to) or scene.points,
+            clock=scene.clock,
+            calibration=scene.calibration,
+            truth=scene.truth,
+            keep=False,
+        ) as writer:
+            for name in scene.names:
+                if name not in left_out:
+                    _copy(scene, writer, name, placed, estimate, to)
+                done()
     return {"written": str(target), "left_out": left_out, "scale": to.scale}
 
 
@@ -123,7 +118,7 @@ def trajectory_of(view: View, estimate: Estimate, to: Similarity) -> Trajectory 
     path = estimate.paths.get(view.name)
     if path is None:
         return None
-    start = view.frame.mid_ns - view.frame.exposure_ns // 2
+    start = view.mid_ns - view.frame.exposure_ns // 2
     at = start + np.rint(path.phases * view.frame.exposure_ns).astype(np.int64)
     cov = np.array(path.cov)
     cov[:, 3:, :] *= to.scale

@@ -13,6 +13,7 @@ from spikerig.calib.consensus import Path, agree, apart_by, averaged, paths_thro
 from spikerig.calib.gauge import centres, extent
 from spikerig.calib.mapping import Map, Options, build_map
 from spikerig.calib.pictures import KINDS, Looks, frame_picture, looks, picture_of, texture_of
+from spikerig.calib.straight import Straight
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.scene import Camera, View
 
@@ -89,6 +90,7 @@ def estimate_poses(
     *,
     rgb_camera: Camera | None = None,
     spike_from_rgb: Floats | None = None,
+    straight: Straight = Straight(),
     keep: Any = None,
     done: Callable[[str], None] = lambda step: None,
 ) -> Estimate:
@@ -100,6 +102,7 @@ def estimate_poses(
         wanted, options: what, and how COLMAP does it.
         rgb_camera: of the frames; None: the same as `camera`.
         spike_from_rgb: [3,4] for `both`; None: one centre, one direction.
+        straight: what puts textures of raw spikes onto `camera`.
         keep: folder for COLMAP's files of the best map.
         done: called with the name of each step.
 
@@ -121,9 +124,9 @@ def estimate_poses(
         pictures = {v.name: frame_picture(v.frame) for v in usable}
         found = build_map(pictures, rgb_camera or camera, options, keep=keep, done=done)
         return _judged(Estimate(names, {n: p.pose for n, p in found.poses.items()}, {}, found, ("rgb",)), wanted)
-    ranked = _ranked(usable, wanted)
+    ranked = _ranked(usable, wanted, straight)
     kinds = wanted.kinds or tuple(look.kind for look in ranked)
-    rigged = _Rigged(usable, camera, wanted, options, rgb_camera or camera, spike_from_rgb, keep, done)
+    rigged = _Rigged(usable, camera, wanted, options, rgb_camera or camera, spike_from_rgb, straight, keep, done)
     maps: dict[str, Map] = {}
     for kind in kinds[: wanted.maps]:
         maps[kind] = rigged.map(kind, first=not maps)
@@ -150,23 +153,25 @@ class _Rigged:
         options: Options,
         rgb_camera: Camera,
         spike_from_rgb: Floats | None,
+        straight: Straight,
         keep: Any,
         done: Callable[[str], None],
     ) -> None:
         self.views, self.camera, self.wanted, self.options = views, camera, wanted, options
         self.rgb_camera, self.spike_from_rgb, self.keep, self.done = rgb_camera, spike_from_rgb, keep, done
+        self.straight = straight
         self.phases = np.linspace(0, 1, wanted.instants) if wanted.instants > 1 else np.array([0.5])
 
     def map(self, kind: str, first: bool = False) -> Map:
         """Map the middle instants by one kind of texture; the first map also takes the further instants."""
         folder = "spike/" if self.wanted.arms == "both" else ""
-        pictures = {f"{folder}{v.name}": look_at(v, 0.5, kind) for v in self.views}
+        pictures = {f"{folder}{v.name}": look_at(v, 0.5, kind, self.straight) for v in self.views}
         further = {}
         if first and self.wanted.instants > 1:
             for v in self.views:
                 for k, phase in enumerate(self.phases):
                     if abs(phase - 0.5) > 1e-9:
-                        picture = look_at(v, phase, kind)
+                        picture = look_at(v, phase, kind, self.straight)
                         further[f"{folder}{v.name}.at{k:03d}"] = (f"{folder}{v.name}", picture)
         rig = None
         if self.wanted.arms == "both":
@@ -224,14 +229,14 @@ def quaternion(R: Floats) -> Floats:
     return q if q[0] >= 0 else -q
 
 
-def look_at(view: View, phase: float, kind: str) -> NDArray[np.uint8]:
-    """The picture of a view by a kind of texture, at a phase of the exposure."""
+def look_at(view: View, phase: float, kind: str, straight: Straight = Straight()) -> NDArray[np.uint8]:
+    """The picture of a view by a kind of texture, at a phase of the exposure; `straight` as in `estimate_poses`."""
     if view.spikes is None:
         raise UsageError("this view has no spikes", value=view.name)
     if kind[:3] == "tfp" and kind[3:].isdigit() and int(kind[3:]) > view.spikes.ticks:
         told = f"{view.name}, {kind}: {view.spikes.ticks} ticks"
         raise UsageError("a texture does not fit the spikes", value=told, next="ask for a shorter window")
-    return picture_of(texture_of(view.spikes, tick_at(view, phase), kind))
+    return picture_of(straight.texture(texture_of(view.spikes, tick_at(view, phase), kind)))
 
 
 def tick_at(view: View, phase: float) -> float:
@@ -239,17 +244,17 @@ def tick_at(view: View, phase: float) -> float:
     frame, spikes = view.frame, view.spikes
     if spikes is None or spikes.rate_hz is None:
         raise UsageError("this view has no spikes with a known rate", value=view.name)
-    start = frame.mid_ns - frame.exposure_ns / 2
+    start = view.mid_ns - frame.exposure_ns / 2
     return float((start + phase * frame.exposure_ns - spikes.t0_ns) * spikes.rate_hz * 1e-9)
 
 
-def _ranked(views: Sequence[View], wanted: Wanted) -> tuple[Looks, ...]:
+def _ranked(views: Sequence[View], wanted: Wanted, straight: Straight) -> tuple[Looks, ...]:
     """Kinds of texture, best first, as measured on a few views; kinds whose window leaves the spikes are left out."""
     some = [views[k] for k in np.unique(np.linspace(0, len(views) - 1, LOOKED_AT).round().astype(int))]
     found = []
     for kind in wanted.kinds or KINDS:
         try:
-            found.append(looks([look_at(v, 0.5, kind) for v in some], kind))
+            found.append(looks([look_at(v, 0.5, kind, straight) for v in some], kind))
         except UsageError:
             if wanted.kinds:
                 raise
@@ -260,7 +265,7 @@ def _ranked(views: Sequence[View], wanted: Wanted) -> tuple[Looks, ...]:
 
 def best_kind(views: Sequence[View]) -> str:
     """The kind of texture that looks best on these views, by measured sharpness and noise."""
-    return _ranked(views, Wanted())[0].kind
+    return _ranked(views, Wanted(), Straight())[0].kind
 
 
 def _arm(found: Map, folder: str) -> Map:

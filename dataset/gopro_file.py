@@ -59,6 +59,7 @@ class GoProClip:
         model, firmware, serial: from the header's MINF, FMWR, CASN; empty where it does not say.
         settings: the header's other keys (EISE, PRTN, EXPT, PIMX, PTWB, VFPS, VRES, ...).
         width, height: pixels.
+        codec: of the pictures, as the file names it: "avc1", "hvc1".
         fps: frames a second by the video track.
         start_ns: int64[N], start of exposure of sensor row 0 of each frame, in the order shown.
         time_source: "CORI": the camera's stamps of frame starts; "pts": the video's own grid, where it has none.
@@ -78,6 +79,7 @@ class GoProClip:
     settings: Mapping[str, Any]
     width: int
     height: int
+    codec: str
     fps: float
     start_ns: NDArray[np.int64]
     time_source: str
@@ -187,6 +189,7 @@ def open_gopro(path: str | Path | Sequence[str | Path]) -> GoProClip:
         settings=settings,
         width=first.video.width,
         height=first.video.height,
+        codec=first.video.format,
         fps=len(start_ns) / lasting,
         start_ns=start_ns,
         time_source="CORI" if all(p.source == "CORI" for p in parts) else "pts",

@@ -38,6 +38,7 @@ def describe_clip(path: Path) -> dict[str, Any]:
         "serial": printable(clip.serial) or None,
         "width": clip.width,
         "height": clip.height,
+        "codec": printable(clip.codec),
         "fps": clip.fps,
         "frames": clip.frames,
         "duration_s": clip.duration_s,

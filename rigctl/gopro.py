@@ -56,12 +56,15 @@ class GoProSource:
     def poll(self) -> dict[str, Any]:
         """Keep the connection alive and tell the state; never asks faster than the camera wants to be asked.
 
-        Edges:
-            Without Bluetooth nothing is known while it records: `dark` is true, the rest None.
+        Returns:
+            busy, encoding, seconds, battery_percent, minutes_left, card_kb, card_state, hot, cold; `dark`: nothing is
+            known (no Bluetooth, and it records: the others are None); `trouble`: what is wrong, in words;
+            `ended_early`: a recording that was started runs no more.
         """
         self._watch.keep_alive()
         told = self._watch.look()
-        return ble.known(told) | {"dark": not told}
+        ended = self._started is not None and bool(told) and not told.get(ble.ENCODING)
+        return ble.known(told) | {"dark": not told, "trouble": self._watch.trouble(), "ended_early": ended}
 
     def start(self) -> None:
         """Start a recording and return when the camera says that it encodes ("accepted" is not enough).

@@ -22,6 +22,10 @@ class Host(Protocol):
         """Return at `at_ns`, or at once if that is past."""
         ...
 
+    def suspended_ns(self) -> int:
+        """How long the computer has been suspended in all: this clock stood still then, those of devices did not."""
+        ...
+
     def worker(self, name: str) -> AbstractContextManager[None]:
         """While inside, the calling thread takes part in the passing of time; names are unique among live threads.
 
@@ -46,6 +50,11 @@ class RealHost:
         left = at_ns - time.monotonic_ns()
         if left > 0:
             time.sleep(left / 1e9)
+
+    def suspended_ns(self) -> int:
+        """CLOCK_BOOTTIME minus CLOCK_MONOTONIC; 0 where the system has no such clock."""
+        boot = getattr(time, "CLOCK_BOOTTIME", None)
+        return 0 if boot is None else max(time.clock_gettime_ns(boot) - time.monotonic_ns(), 0)
 
     def worker(self, name: str) -> AbstractContextManager[None]:
         """Nothing: real time waits for nobody."""

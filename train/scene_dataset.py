@@ -11,13 +11,14 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
+from spikerig.calib.straight import Straight, straight_of
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.images import linear_from_srgb, srgb_from_linear
 from spikerig.dataset.scene import View
 from spikerig.dataset.spikes import SpikeStream
 from spikerig.dataset.store import SceneFile, open_scene
 from spikerig.dataset.texture import Texture, tfi, tfp, tfp_adaptive
-from spikerig.train.trajectory import instant_ns, phases, sub_pose
+from spikerig.train.trajectory import phases, sub_pose
 
 TEXTURES: dict[str, Callable[[SpikeStream, float, int], Texture]] = {
     "tfp": tfp,
@@ -71,6 +72,7 @@ class SceneDataset(Dataset[dict[str, Any]]):
         self._file: SceneFile | None = None
         self._owner = 0
         with open_scene(self.path) as scene:
+            self.straight = straight_of(scene) if self.textures else Straight()
             self.names = {"train": scene.train, "test": scene.test, "all": scene.names}[split]
 
     def __len__(self) -> int:
@@ -92,7 +94,7 @@ class SceneDataset(Dataset[dict[str, Any]]):
             codes = linear_from_srgb(codes)
         elif (view.frame.transfer, self.encoding) == ("linear", "srgb"):
             codes = srgb_from_linear(codes)
-        at_ns = [instant_ns(view.frame, phase) for phase in self.phases]
+        at_ns = [view.instant_ns(phase) for phase in self.phases]
         item: dict[str, Any] = {
             "name": view.name,
             "image": torch.from_numpy(np.asarray(codes, np.float32)),
@@ -120,5 +122,5 @@ class SceneDataset(Dataset[dict[str, Any]]):
                 next="align the take first",
             )
         ticks = [view.spikes.tick_at(round(t)) for t in at_ns]
-        made = [TEXTURES[name](view.spikes, tick, self.window) for tick in ticks]
+        made = [self.straight.texture(TEXTURES[name](view.spikes, tick, self.window)) for tick in ticks]
         return np.stack([t.light for t in made]), np.stack([t.known for t in made])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -70,7 +70,7 @@ class World:
                 at += 7_500_000 + int(rng.integers(1_000_000))
                 there = link.out.arrives_ns(at, rng)
                 back = link.back.arrives_ns(there, rng)
-                box = int(self.at("box", there)) // stamp_ns * stamp_ns
+                box = int(self.at("box", there)) // stamp_ns * stamp_ns + stamp_ns // 2
                 found.append(Probe("box", 0, int(self.at("host", at)), box, int(self.at("host", back))))
                 at = back
         return found
@@ -107,8 +107,3 @@ class World:
     def off_ns(self, model, clock: str, true_ns: ArrayLike, origin_ns: int, rig: str = "box") -> Int64:
         """A fitted map's error at true times: its rig time minus the true one."""
         return model.rig_from_device(self.at(clock, true_ns)) - (self.at(rig, true_ns) - origin_ns)
-
-
-def with_ramp(world: World, ppm_per_min: float) -> World:
-    """The same world warming at another rate."""
-    return replace(world, ramp_ppm_per_min=ppm_per_min)

@@ -201,7 +201,7 @@ class AirLink:
             if self.air.many in self.camera.faults.broken_replies:
                 parts = _damage(parts, self.camera.faults.broken_how)
             self.air.many += 1
-        at = self.host.now_ns() + late
+        at = self.camera.now_ns + late
         for part in parts:
             at = max(self.air.back.arrives_ns(at, self.camera.rng), self._last_ns if not late else 0)
             self._count += 1

@@ -129,6 +129,7 @@ class GoProCamera:
         self.clips = max((int(p.name[4:8]) for p in self.card.glob("100GOPRO/G*.MP4")), default=0)
         self._due: list[tuple[int, int, Callable[[], None]]] = []
         self._count = 0
+        self._event_ns: int | None = None
         self._unrendered: list[tuple[int, Recording]] = []
         for status, at_s in ((_FULL, self.faults.card_full_s), (_FLAT, self.faults.battery_flat_s),
                              (_HOT, self.faults.too_hot_s)):  # fmt: skip
@@ -146,7 +147,14 @@ class GoProCamera:
         """Let happen what is due by now."""
         with self.lock:
             while self._due and self._due[0][0] <= self.host.now_ns():
-                heapq.heappop(self._due)[2]()
+                self._event_ns, _, what = heapq.heappop(self._due)
+                what()
+            self._event_ns = None
+
+    @property
+    def now_ns(self) -> int:
+        """The time of what happens at the moment, which may be looked at later; else the host's."""
+        return self.host.now_ns() if self._event_ns is None else self._event_ns
 
     @property
     def next_ns(self) -> int | None:
@@ -157,14 +165,14 @@ class GoProCamera:
         return round(MS * self.rng.uniform(*span))
 
     def _now_and(self, delay_ns: int) -> int:
-        return self.host.now_ns() + delay_ns
+        return self.now_ns + delay_ns
 
     # ---- what it says of itself -------------------------------------------------------------------------------------
 
     @property
     def dark(self) -> bool:
         """Whether HTTP is silent: while it encodes (HindSight does too), some moments after, and asleep."""
-        return self.asleep or self.encoding or self.hindsight or self.host.now_ns() < self.dark_until_ns
+        return self.asleep or self.encoding or self.hindsight or self.now_ns < self.dark_until_ns
 
     @property
     def hindsight(self) -> bool:
@@ -175,11 +183,11 @@ class GoProCamera:
     def full(self) -> bool:
         """The card has no space."""
         at = self.faults.card_full_s
-        return at is not None and self.host.now_ns() >= at * NS
+        return at is not None and self.now_ns >= at * NS
 
     def statuses(self) -> dict[int, int | str]:
         """Documented statuses by id."""
-        now, faults = self.host.now_ns(), self.faults
+        now, faults = self.now_ns, self.faults
         hot = faults.too_hot_s is not None and now >= faults.too_hot_s * NS
         flat = faults.battery_flat_s is not None and now >= faults.battery_flat_s * NS
         seconds = (now - self.first_ns) // NS if self.encoding and now > self.first_ns else 0
@@ -283,7 +291,7 @@ class GoProCamera:
             lead_us=round(self.rng.uniform(20_000, 120_000)), skipped=self.faults.skipped,
             header=menu.header(self.settings) | {
                 "MINF": self.nature.model, "FMWR": self.nature.firmware, "CASN": self.nature.serial,
-            }, seed=self.seed + self.clips,
+            }, seed=self.seed + self.clips, hevc=self.settings[menu.CODEC] == 1,
         )  # fmt: skip
         self._unrendered.append((self.clips, take))
         self.truth.append({

@@ -1,4 +1,4 @@
-"""The clip an emulated GoPro writes: H.264 pictures of a scene, and the telemetry that tells their true times."""
+"""The clip an emulated GoPro writes: H.264 or H.265 pictures of a scene, and telemetry that tells their true times."""
 
 from __future__ import annotations
 
@@ -42,6 +42,7 @@ class Recording:
         header: keys of the settings in `moov/udta/GPMF`, over those of a HERO9.
         spare: frame stamps beyond the last frame; a real clip had one.
         seed: of the sensors' noise.
+        hevc: H.265 pictures in GX files, else H.264 in GH files.
     """
 
     clock: Oscillator
@@ -55,6 +56,7 @@ class Recording:
     header: dict[str, Any] = field(default_factory=dict)
     spare: int = 1
     seed: int = 0
+    hevc: bool = False
 
     @property
     def sensor_numbers(self) -> NDArray[np.int64]:
@@ -92,7 +94,7 @@ def hero9_header(**over: Any) -> dict[str, Any]:
 
 
 def write_clip(folder: Path, number: int, take: Recording, pictures: Pictures, chapter_bytes: int) -> list[Path]:
-    """Write a clip as chapters GX01nnnn.MP4, GX02nnnn.MP4, ...; a chapter ends at a key frame once it is full.
+    """Write a clip as chapters GH01nnnn.MP4, GH02nnnn.MP4, ...; a chapter ends at a key frame once it is full.
 
     Raises:
         HostError: PyAV is not installed, or the disk refuses.
@@ -100,7 +102,7 @@ def write_clip(folder: Path, number: int, take: Recording, pictures: Pictures, c
     paths: list[Path] = []
     first = 0
     while first < take.frames:
-        path = folder / f"GX{len(paths) + 1:02d}{number:04d}.MP4"
+        path = folder / f"G{'X' if take.hevc else 'H'}{len(paths) + 1:02d}{number:04d}.MP4"
         count = _encode(path, take, first, pictures, chapter_bytes)
         last = first + count >= take.frames
         _add_telemetry(path, take, first, count + (take.spare if last else 0), count)
@@ -117,10 +119,14 @@ def _encode(path: Path, take: Recording, first: int, pictures: Pictures, most_by
         raise HostError("the emulated camera needs PyAV", next='pip install "spikerig[video]"') from error
     starts, exposures = take.true_starts_ns, take.exposures_s
     bytes_ = done = height = 0
-    tuning = {"preset": "ultrafast", "crf": "16", "bf": "0", "g": str(KEY_FRAME), "x264-params": "scenecut=0"}
+    tuning = {"preset": "ultrafast", "crf": "16", "bf": "0", "g": str(KEY_FRAME)}
+    if take.hevc:
+        tuning["x265-params"] = f"bframes=0:scenecut=0:keyint={KEY_FRAME}:pools=none:frame-threads=1:log-level=none"
+    else:
+        tuning["x264-params"] = "scenecut=0"
     scale = {"video_track_timescale": str(take.fps.numerator)}
     with av.open(str(path), "w", format="mp4", options=scale) as container:
-        video: Any = container.add_stream("libx264", rate=take.fps, options=tuning)
+        video: Any = container.add_stream("libx265" if take.hevc else "libx264", rate=take.fps, options=tuning)
         video.codec_context.thread_count = 1  # the same bits on every run
         video.codec_context.time_base = 1 / take.fps
         for k in range(first, take.frames):
@@ -139,8 +145,7 @@ def _encode(path: Path, take: Recording, first: int, pictures: Pictures, most_by
                 bytes_ += packet.size
                 container.mux(packet)
             done += 1
-        for packet in video.encode():
-            container.mux(packet)
+        container.mux(video.encode())
     return done
 
 

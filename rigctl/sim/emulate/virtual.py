@@ -31,6 +31,15 @@ class VirtualHost:
         self._names: dict[int, str] = {}  # thread -> worker, those that take part
         self._awake = 0
         self._count = 0
+        self._suspended = 0
+
+    def suspended_ns(self) -> int:
+        """What `suspend` was told in all."""
+        return self._suspended
+
+    def suspend(self, for_ns: int) -> None:
+        """Suspend the computer: nothing moves here; devices that outlive it add `suspended_ns` to true time."""
+        self._suspended += int(for_ns)
 
     def now_ns(self) -> int:
         """The time now."""
