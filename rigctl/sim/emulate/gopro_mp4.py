@@ -160,7 +160,7 @@ def _add_telemetry(path: Path, take: Recording, first: int, stamped: int, frames
         _payload(take, k, min(k + per, first + stamped), first + frames) for k in range(first, first + stamped, per)
     ]  # fmt: skip
     lasts = [round(1000 * min(per, first + frames - k) / float(take.fps)) for k in range(first, first + stamped, per)]
-    offsets = (at + 8 + np.cumsum([0, *map(len, payloads[:-1])])).tolist()
+    offsets = (at + np.cumsum([0, *map(len, payloads[:-1])])).tolist()
     moov = raw[at + 8 :]
     scale = int.from_bytes(raw[raw.find(b"mvhd", at) + 16 :][:4], "big")
     track = telemetry_track(2, [len(p) for p in payloads], offsets, [max(n, 1) for n in lasts], scale)
@@ -168,7 +168,11 @@ def _add_telemetry(path: Path, take: Recording, first: int, stamped: int, frames
     cut = moov.find(b"udta") - 4  # ffmpeg's own, the last of its boxes
     moov = moov[:cut] if cut >= 0 else moov
     part = path.with_suffix(".part")
-    part.write_bytes(raw[:at] + box("mdat", *payloads) + box("moov", moov, user, track))
+    head = box("ftyp", b"mp41", bytes.fromhex("20131018"), b"mp41")  # as GoPro's; ffmpeg's is longer
+    start = raw.find(b"mdat") - 4
+    head += box("free", bytes(start - len(head) - 8))
+    media = box("mdat", raw[start + 8 : at], *payloads)  # one of them, as GoPro writes and its own reader wants
+    part.write_bytes(head + media + box("moov", moov, user, track))
     os.replace(part, path)
 
 
