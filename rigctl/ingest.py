@@ -51,9 +51,10 @@ class IngestConfig:
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """A frame of a view, and the spikes around it, in rig time."""
+    """A frame of a view and the RGB sensor's row of each of its rows, and the spikes around it, in rig time."""
 
     frame: Frame
+    rows: NDArray[np.float32]
     spikes: SpikeStream
     sigma_ns: float
 
@@ -132,7 +133,7 @@ def _add(
     writer: SceneWriter, name: str, view: TakenView, cut: Cut, split: Any, world: TrueWorld | None, told: dict[str, Any]
 ) -> None:
     height, width = cut.frame.pixels.shape[:2]
-    rows = np.repeat(np.arange(height, dtype=np.float32)[:, None], width, 1)
+    rows = np.repeat(cut.rows[:, None], width, 1)
     plain = View(
         name, cut.frame, cut.spikes, rows, np.ones((height, width), bool), Pose(np.eye(3, 4)), None, split
     )  # fmt: skip
@@ -183,7 +184,9 @@ def cut_view(
         t0 = max(first, int(np.floor(_tick_at(rig_of, first, last, starts - margin))))
         t1 = min(last, int(np.ceil(_tick_at(rig_of, first, last, ends + margin))))
         sigma = float(np.hypot(spike.sigma_at(device_ns(profile, start)), rgb.sigma_at(int(clip.start_ns[number]))))
-        cuts.append(Cut(_sized(frame, clip, starts, profile), _spikes(wire, epoch, offset, t0, t1, rig_of), sigma))
+        rows = (np.arange(profile.height, dtype=np.float32) + 0.5) * (clip.height / profile.height) - 0.5
+        spikes = _spikes(wire, epoch, offset, t0, t1, rig_of)
+        cuts.append(Cut(_sized(frame, starts, profile), rows, spikes, sigma))
     return cuts
 
 
@@ -237,14 +240,13 @@ def _frames(
     return sorted(int(k) for k in good[np.argsort(apart, kind="stable")[: config.frames]])
 
 
-def _sized(frame: Frame, clip: GoProClip, start_ns: int, profile: WireProfile) -> Frame:
-    """The picture brought to the spike camera's size by area, in linear light; rows keep their times."""
+def _sized(frame: Frame, start_ns: int, profile: WireProfile) -> Frame:
+    """The picture brought to the spike camera's size by area, in linear light; times are the sensor rows' still."""
     pixels = frame.pixels
     if pixels.shape[:2] != (profile.height, profile.width):
         light = np.asarray(linear_from_srgb(np.asarray(pixels, np.float32) / frame.full), np.float32)
         pixels = srgb8_from_linear(area_resize(light, profile.width, profile.height))
-    row_ns = round((clip.row_ns or 0.0) * clip.height / profile.height)
-    return replace(frame, pixels=pixels, start_ns=start_ns, row_ns=row_ns, clock="rig")
+    return replace(frame, pixels=pixels, start_ns=start_ns, clock="rig")
 
 
 def _spikes(

@@ -64,20 +64,20 @@ class TrueWorld:
         session = next((s for s in self.sessions if s["start_ns"] <= taken.start_ns <= s["end_ns"]), None)
         if session is None:
             raise DataError("no session of the emulated rig covers this view", value=view.name)
-        frame = view.frame
-        end = frame.start_ns + frame.exposure_ns + frame.row_ns * (frame.pixels.shape[0] - 1)
-        at = np.unique(np.append(np.linspace(frame.start_ns, end, KNOTS).astype(np.int64), frame.mid_ns))
+        frame, mid_ns = view.frame, view.mid_ns
+        end = frame.start_ns + frame.exposure_ns + round(frame.row_ns * float(view.sensor_row.max()))
+        at = np.unique(np.append(np.linspace(frame.start_ns, end, KNOTS).astype(np.int64), mid_ns))
         number = self._numbers[taken.name]
         poses = self.world.poses(number, self.times.true_from_rig(session, at))
-        pose = poses[int(np.searchsorted(at, frame.mid_ns))]
+        pose = poses[int(np.searchsorted(at, mid_ns))]
         light, path = self.world.sharp(pose), Trajectory(at, poses)
         view = replace(view, pose=Pose(pose), trajectory=path)
         if view.split == "test":
-            sharp = Frame(encode(light), start_ns=frame.mid_ns)
+            sharp = Frame(encode(light), start_ns=mid_ns)
             view = replace(view, frame=sharp, spikes=None, trajectory=None)
         else:
             self._add_points(view, number)
-        return TrueView(view, light, frame.mid_ns, path)
+        return TrueView(view, light, mid_ns, path)
 
     def points(self) -> Points:
         """The surface points of all training views so far."""

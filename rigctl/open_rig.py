@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from spikerig.dataset.errors import DeviceError
 from spikerig.dataset.rawtake import read_lines
+from spikerig.dataset.terminal import note
+from spikerig.rigctl.devices import DeviceFacts
 from spikerig.rigctl.host import RealHost
 from spikerig.rigctl.record import Rig
 from spikerig.rigctl.take_plan import TakePlan
@@ -32,25 +35,38 @@ def open_rig(plan: TakePlan, take: Path, emulate: str = "", resume: bool = False
 
 
 def _real(plan: TakePlan) -> Rig:
-    from spikerig.rigctl.syncbox import HarpBox, find_port, serial_opener
+    from spikerig.rigctl.syncbox import HarpBox, find, serial_opener
     from spikerig.rigctl.vidar import VidarSource
 
     host = RealHost()
     spike = VidarSource(plan.profile, host, serial=plan.spike.serial)
+    box = None
     try:
-        box = None
         if plan.sync.mode == "box":
-            port = plan.sync.port or find_port(host)
+            port = plan.sync.port or _only(*find(host))
             box = HarpBox(serial_opener(port), host, address=port)
         rgb = None
         if plan.rgb.use:
             from spikerig.rigctl.gopro import open_gopro
 
-            rgb = open_gopro(host)
+            rgb = open_gopro(host, link=plan.rgb.link, name=plan.rgb.camera, say=note)
     except BaseException:
         spike.close()
+        if box is not None:
+            box.close()
         raise
     return Rig(host, spike, rgb, box)
+
+
+def _only(boxes: list[DeviceFacts], reasons: list[str]) -> str:
+    """The port of the only clock box there is."""
+    if len(boxes) != 1:
+        raise DeviceError(
+            "no clock box is found" if not boxes else "there are several clock boxes",
+            value="; ".join(reasons) or ", ".join(b.address for b in boxes) or None,
+            next='plug it in, name its port in [sync] port, or set [sync] mode = "optical"',
+        )
+    return boxes[0].address
 
 
 def _last_ns(take: Path) -> int:
