@@ -75,7 +75,7 @@ class Aligned:
         texture: of the spikes, known only where the spike arm sees.
         sensor_row: float32[H,W] row of the raw RGB picture: a pixel was exposed from start_ns + row_ns * sensor_row.
         valid: bool[H,W], both arms see it.
-        frame: `light` encoded, with the times of the raw frame (its rows are the raw picture's; see `own_rows`).
+        frame: `light` encoded, with the times of the raw frame: its rows are the raw picture's (`sensor_row`).
     """
 
     camera: Camera
@@ -88,26 +88,6 @@ class Aligned:
     def __post_init__(self) -> None:
         for name in ("light", "sensor_row", "valid"):
             object.__setattr__(self, name, frozen_array(getattr(self, name)))
-
-
-def own_rows(aligned: Aligned, raw_rows: int) -> tuple[Frame, NDArray[np.float32]]:
-    """The frame and its sensor rows with times told in the aligned picture's own rows, as a scene's views tell them.
-
-    Args:
-        aligned: a view.
-        raw_rows: rows of the raw picture.
-
-    Returns:
-        (frame, sensor_row): start_ns + row_ns * sensor_row is the same time as before, to half a nanosecond a row, and
-        the frame's `mid_ns` is that of its middle row.
-    """
-    f, rows = aligned.frame, len(aligned.sensor_row)
-    seen = aligned.sensor_row[aligned.valid] if aligned.valid.any() else np.array([0.0, raw_rows])
-    first, share = float(seen.min()), max(float(np.ptp(seen)), 1.0) / rows
-    row_ns = round(f.row_ns * share)
-    frame = replace(f, start_ns=f.start_ns + round(f.row_ns * first), row_ns=row_ns)
-    per_row = row_ns / f.row_ns if f.row_ns else share
-    return frame, np.where(aligned.valid, (aligned.sensor_row - first) / per_row, 0).astype(np.float32)
 
 
 def warp_of(
@@ -236,17 +216,20 @@ def warp_light(warp: Warp, linear: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def warp_texture(warp: Warp, texture: Texture) -> Texture:
     """A texture of the raw spikes on the pinhole camera; known where KNOWN of what a pixel shows is known."""
-    if warp.same:
-        return texture
+    return texture if warp.same else texture_at(texture, warp.spike_px)
+
+
+def texture_at(texture: Texture, px: Floats) -> Texture:
+    """A texture of the raw spikes at pixels float64[H,W,2] between its own; known where KNOWN of what one shows is."""
     import cv2
 
-    at = np.nan_to_num(warp.spike_px - 0.5, nan=-10).astype(np.float32)
+    at = np.nan_to_num(px - 0.5, nan=-10).astype(np.float32)
     known = texture.known.astype(np.float32)
     both = np.stack([np.where(texture.known, texture.light, 0), known], -1)
     both = cv2.copyMakeBorder(both, 1, 1, 1, 1, cv2.BORDER_REPLICATE)  # a pixel's own rim is part of it
     moved = cv2.remap(both, at[..., 0] + 1, at[..., 1] + 1, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     share = moved[..., 1]
-    inside = (share > KNOWN) & _within(warp.spike_px, (texture.light.shape[1], texture.light.shape[0]))
+    inside = (share > KNOWN) & _within(px, (texture.light.shape[1], texture.light.shape[0]))
     light = np.divide(moved[..., 0], share, out=np.zeros_like(share), where=inside)
     return Texture(light, inside, texture.at, texture.method)
 

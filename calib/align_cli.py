@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,7 +15,7 @@ from spikerig.dataset.terminal import Progress, emit, jsonable, note
 if TYPE_CHECKING:
     from spikerig.calib.agree import Agreement
     from spikerig.calib.align import Aligned, Warp
-    from spikerig.calib.aligned_scene import Checked
+    from spikerig.calib.aligned_scene import Checked, Wish
     from spikerig.calib.rig import RigCalibration
     from spikerig.calib.sheet import Row
     from spikerig.dataset.scene import View
@@ -56,11 +55,13 @@ def align(
     Spikes stay raw. The result is held edge against edge; where both arms do not agree it is refused (exit 4).
     """
     from spikerig.calib.aligned_scene import WORST_PX, Wish, check_alignment, write_aligned
+    from spikerig.calib.plots import spot_of
     from spikerig.calib.regions import check_regions, panel_of, read_regions, regions_json
     from spikerig.calib.rig import read_calibration
     from spikerig.calib.sheet import page
     from spikerig.dataset.flat import read_flat
     from spikerig.dataset.outfile import refuse_existing, whole_file
+    from spikerig.dataset.provenance import origin_of
     from spikerig.dataset.store import open_scene
 
     record = read_calibration(calibration)
@@ -80,19 +81,20 @@ def align(
         bar = Progress("aligning", len(scene.names), "views")
         pictures = _Pictures(overlays, record, sheet is not None)
         checked = check_alignment(scene, record, wish, lambda *told: (pictures.take(*told), bar.step())[0])
-        poses = [scene.view(name, spikes=False).pose for name in scene.names]
+        spots = [spot_of(scene.view(name, spikes=False)) for name in scene.names]
         name, worst = scene.name, checked.median_px
+        origin = origin_of(
+            scene, "opencv-contrib-python-headless", "h5py", files={"calibration": calibration, "flat": flat}
+        )
     accepted = bool(worst <= WORST_PX)
-    told = _report(source, record, checked, accepted, force, refine)
+    told = _report(source, record, checked, accepted, force, refine) | {"versions": origin["versions"]}
     told |= {"regions": regions_json(given), "panels": None if not find_panel else {
         name: regions_json(found) for name, found in checked.panels.items()}}  # fmt: skip
     if sheet is not None:
         with whole_file(sheet, force=force) as part:
-            part.write_text(page(name, record, pictures.rows, poses), encoding="utf-8")
+            part.write_text(page(name, record, pictures.rows, spots), encoding="utf-8")
     if (accepted or force) and not check:
-        kept = ("calibration", "edges_px", "refinement", "accepted", "forced", "regions", "panels", "versions")
-        provenance = {k: told[k] for k in kept}
-        provenance |= {"depth_mm": depth_mm, "flat": None if flat is None else flat.name}
+        provenance = _provenance(told, origin, wish, record, depth_mm)
         told |= write_aligned(source, record, checked, jsonable(provenance), out=out, force=force)
     if as_json:
         emit("spikerig.calib.align/1", told)
@@ -141,9 +143,19 @@ def _report(
         "valid": float(np.mean([checked.warp_of(name).valid.mean() for name in checked.agreement] or [0.0])),
         "refinement": checked.refinement if refine else None,
         "spikes_lie_on_the_camera": checked.warp.same,
-        "versions": {"spikerig": version("spikerig"), "numpy": np.__version__},
         "written": None,
     }
+
+
+def _provenance(
+    told: dict[str, Any], origin: dict[str, Any], wish: Wish, record: RigCalibration, depth_mm: float | None
+) -> dict[str, Any]:
+    """What the aligned scene keeps of how it was made, as info.align."""
+    kept = ("calibration", "model", "edges_px", "valid", "refinement", "accepted", "reasons", "forced")
+    options = {"depth_mm": depth_mm, "refine": wish.refine, "flat": wish.flat is not None}
+    residuals = {"board_px": record.residual_px, "crop_px": record.sd.get("crop_px")}
+    parts = {k: told[k] for k in (*kept, "regions", "panels")}
+    return parts | origin | {"options": options, "residuals": residuals}
 
 
 def _say(told: dict[str, Any], checked: Checked, record: RigCalibration) -> None:
@@ -157,8 +169,8 @@ def _say(told: dict[str, Any], checked: Checked, record: RigCalibration) -> None
     if record.model == "stereo":
         note("note: a stereo rig is aligned at one depth only; elsewhere edges lie apart")
     if not checked.warp.same:
-        note("note: spikes stay raw, on a lens that distorts or mirrors: textures made of them must be warped too "
-             "(calib.align.warp_texture)")  # fmt: skip
+        note("note: spikes stay raw, on a lens that distorts or mirrors: `train` and `calib poses` straighten them; "
+             "in code of your own, calib.straight does")  # fmt: skip
     for text in told["reasons"]:
         note(f"refused: {text}: calibrate again, or try --refine; was the rig touched since?")
     if told["written"]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +17,6 @@ from spikerig.calib.align import (
     Warp,
     coded_like,
     linear_of,
-    own_rows,
     pair,
     rows_of_spike_px,
     warp_light,
@@ -31,6 +29,7 @@ from spikerig.calib.rig import RigCalibration, as_json
 from spikerig.calib.rolling import exposure_texture
 from spikerig.dataset.errors import RefusedError, UsageError
 from spikerig.dataset.flat import FlatField, flattened
+from spikerig.dataset.outfile import refuse_existing, stand_in
 from spikerig.dataset.scene import Truth, View
 from spikerig.dataset.store import SceneFile, open_scene
 from spikerig.dataset.texture import Texture
@@ -168,28 +167,22 @@ def write_aligned(
     from spikerig.dataset.store import SceneWriter
 
     target = out or path
-    if out is not None and out.exists() and not force:
-        raise UsageError("the file exists already", value=out, next="give --force to replace it")
-    beside = target.with_name(f".{target.stem}.align.{os.getpid()}{target.suffix}")
-    with open_scene(path) as scene:
+    if out is not None:
+        refuse_existing(out, force)
+    with open_scene(path) as scene, stand_in(target, "align") as beside:
         same = same_camera(scene, checked.warp)
         truth = scene.truth
         if truth is not None and not same:
             truth = replace(truth, light={})
-        try:
-            with SceneWriter(
-                beside, scene.name, checked.warp.camera, light_gain=calibration.split_ratio or scene.light_gain,
-                info={**scene.info, "align": provenance}, points=scene.points, clock=scene.clock,
-                calibration={**as_json(calibration), "id": calibration.id}, truth=truth, keep=False,
-            ) as writer:  # fmt: skip
-                for name in scene.names:
-                    writer.add(
-                        _aligned_view(scene.view(name), checked.warp_of(name)), **_truth(scene, name, truth, same)
-                    )
-                    done()
-            os.replace(beside, target)
-        finally:
-            beside.unlink(missing_ok=True)
+        with SceneWriter(
+            beside, scene.name, checked.warp.camera, light_gain=calibration.split_ratio or scene.light_gain,
+            info={**scene.info, "align": provenance}, points=scene.points, clock=scene.clock,
+            calibration={**as_json(calibration), "id": calibration.id}, truth=truth, keep=False,
+        ) as writer:  # fmt: skip
+            for name in scene.names:
+                warp = checked.warp_of(name)
+                writer.add(_aligned_view(scene.view(name), warp), **_truth(scene, name, truth, same))
+                done()
     return {"written": str(target), "true_light_kept": bool(same and scene.has_truth)}
 
 
@@ -203,10 +196,8 @@ def same_camera(scene: SceneFile, warp: Warp) -> bool:
 
 def _aligned_view(view: View, warp: Warp) -> View:
     light = np.where(warp.valid[..., None], warp_light(warp, linear_of(view.frame)), 0)
-    nothing = Texture(np.zeros(warp.valid.shape, np.float32), np.zeros(warp.valid.shape, bool), 0.0, "none")
     frame = replace(view.frame, pixels=coded_like(view.frame, light))
-    told = Aligned(warp.camera, light, nothing, warp.sensor_row, warp.valid, frame)
-    frame, rows = own_rows(told, view.frame.pixels.shape[0])
+    rows = np.where(warp.valid, warp.sensor_row, 0)
     return replace(view, frame=frame, sensor_row=rows, valid=warp.valid)
 
 

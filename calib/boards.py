@@ -187,26 +187,42 @@ def _dictionary(name: str) -> Any:
 
 
 def _find_charuco(gray: NDArray[np.uint8], board: Board) -> Found | None:
-    """Markers do not read in a mirror: the picture is tried both ways, and the better one says how it was seen."""
+    """Markers do not read in a mirror: the picture is tried both ways, and the better one says how it was seen.
+
+    Boards with an even number of rows of squares are sought with OpenCV's old pattern too (before 4.6), if need be.
+    """
+    import cv2
+
+    scale = 2 if gray.shape[1] < SMALL else 1
+    large = (
+        gray if scale == 1 else np.asarray(cv2.resize(gray, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), np.uint8)
+    )
+    for old in (False, True) if board.rows % 2 else (False,):
+        found = _find_pattern(large, board, old)
+        if found is not None:
+            return replace(found, px=found.px / scale)
+    return None
+
+
+def _find_pattern(gray: NDArray[Any], board: Board, old: bool) -> Found | None:
     import cv2
 
     made = cv2.aruco.CharucoBoard(
         (board.cols + 1, board.rows + 1), board.square_mm, board.marker_mm, _dictionary(board.charuco)
     )
+    made.setLegacyPattern(old)
     # Where the library has its corners, in squares: its origin and direction have changed between versions.
     at = np.asarray(made.getChessboardCorners(), np.float64)[:, :2] / board.square_mm
     cell = np.rint(at - at.min(0)).astype(int)
     label = cell[:, 1] * board.cols + cell[:, 0]
     detector = cv2.aruco.CharucoDetector(made)
-    scale = 2 if gray.shape[1] < SMALL else 1
-    large = gray if scale == 1 else cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
     best: Found | None = None
     for mirrored in (False, True):
-        corners, ids, _, _ = detector.detectBoard(np.ascontiguousarray(large[:, ::-1]) if mirrored else large)
+        corners, ids, _, _ = detector.detectBoard(np.ascontiguousarray(gray[:, ::-1]) if mirrored else gray)
         if ids is None or len(ids) < 6 or (best is not None and len(ids) <= best.seen.sum()):
             continue
         px = np.full((len(label), 2), np.nan)
-        px[label[np.asarray(ids).ravel()]] = ours(corners) / scale
+        px[label[np.asarray(ids).ravel()]] = ours(corners)
         if mirrored:
             px[:, 0] = gray.shape[1] - px[:, 0]
         best = Found(px, np.isfinite(px[:, 0]), "charuco", mirrored)

@@ -12,6 +12,7 @@ from spikerig.dataset.check import Undecided
 
 Floats = NDArray[np.float64]
 LAGS = 13
+SOFT = 1.5  # px
 MIN_VIEWS = 3
 DEPTH = 0.02  # by which the misfit must rise towards both ends, relative to the least
 
@@ -25,6 +26,7 @@ class Lagged:
         misfit: float64[L], squared residual after the picture's colours and an offset are fitted.
         cross: float64[L,2], residual times slopes of the fitted picture across and down.
         slopes: float64[L,2,2], the slopes' own products.
+        power: squared deviation of the unshifted texture from its mean.
         window: ticks of the exposure.
     """
 
@@ -32,6 +34,7 @@ class Lagged:
     misfit: Floats
     cross: Floats
     slopes: Floats
+    power: float
     window: float
 
 
@@ -62,21 +65,33 @@ def lagged(
     Cost:
         A projection on four columns a lag.
     """
-    colours = [light[..., c].astype(np.float64) for c in range(3)]
-    columns = np.stack([*(c[good] for c in colours), np.ones(int(good.sum()))], 1)
-    down, across = (np.stack([np.gradient(c, axis=a)[good] for c in colours], 1) for a in (0, 1))
+    colours = [_soft(light[..., c], good) for c in range(3)]
+    some = np.zeros_like(good)
+    some[::2, ::2] = good[::2, ::2]  # of smooth pictures every other pixel says all
+    columns = np.stack([*(c[some] for c in colours), np.ones(int(some.sum()))], 1)
+    down, across = (np.stack([np.gradient(c, axis=a)[some] for c in colours], 1) for a in (0, 1))
     q, r = np.linalg.qr(columns)
     usable = np.abs(np.diag(r)) > 1e-6 * np.abs(np.diag(r)).max()
     q = q if usable.all() else np.linalg.svd(columns, full_matrices=False)[0][:, : int(usable.sum())]
     misfit, cross, slopes = np.zeros(len(lags)), np.zeros((len(lags), 2)), np.zeros((len(lags), 2, 2))
     for k, texture in enumerate(textures):
-        seen = texture[good].astype(np.float64)
+        seen = _soft(texture, good)[some]
         weights = np.linalg.lstsq(columns, seen, rcond=None)[0][:3]
         left = seen - q @ (q.T @ seen)
         slope = np.stack([across @ weights, down @ weights], 1)
         slope -= q @ (q.T @ slope)
         misfit[k], cross[k], slopes[k] = left @ left, slope.T @ left, slope.T @ slope
-    return Lagged(np.asarray(lags, np.int64), misfit, cross, slopes, window)
+    middle = _soft(textures[len(textures) // 2], good)[some]
+    power = float(((middle - middle.mean()) ** 2).sum())
+    return Lagged(np.asarray(lags, np.int64), misfit, cross, slopes, power, window)
+
+
+def _soft(light: NDArray[np.float32], good: NDArray[np.bool_]) -> Floats:
+    """A picture smoothed over SOFT px within `good`: less noise, and slopes that hold over some pixels of shift."""
+    import cv2
+
+    weight = cv2.GaussianBlur(good.astype(np.float64), (0, 0), SOFT)
+    return cv2.GaussianBlur(np.where(good, light, 0).astype(np.float64), (0, 0), SOFT) / np.maximum(weight, 1e-6)
 
 
 def lag_of(views: Sequence[Lagged]) -> Lag:
@@ -107,8 +122,8 @@ def lag_of(views: Sequence[Lagged]) -> Lag:
 
 
 def _misfit(views: Sequence[Lagged]) -> Floats:
-    """float64[L] of all views, each over its own least, a shared shift taken out."""
-    weights = [1 / max(float(v.misfit.min()), 1e-300) for v in views]
+    """float64[L] of all views, each as a share of its power, a shared shift taken out."""
+    weights = [1 / max(v.power, 1e-300) for v in views]
     misfit, cross, slopes = (
         np.sum([w * getattr(v, key) for w, v in zip(weights, views, strict=True)], axis=0)
         for key in ("misfit", "cross", "slopes")

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from spikerig.dataset.scene import View
+
 Floats = NDArray[np.float64]
 SIDE, RIM = 420, 26  # px of a camera plot, and free rim
 DOTS = 500  # points drawn
@@ -33,6 +35,13 @@ class Spot:
     def centre(self) -> Floats:
         """Where it stands."""
         return -self.pose[:, :3].T @ self.pose[:, 3]
+
+
+def spot_of(view: View) -> Spot:
+    """A view's camera."""
+    path = view.trajectory
+    centres = None if path is None else np.stack([-m[:, :3].T @ m[:, 3] for m in path.poses])
+    return Spot(view.name, view.pose.cam_from_world, view.split, centres)
 
 
 def histogram(values: Sequence[float], label: str, *, bound: float | None = None, bins: int = 24) -> str:
@@ -65,8 +74,10 @@ def histogram(values: Sequence[float], label: str, *, bound: float | None = None
     return _svg(wide + RIM, base + 38, parts)
 
 
-def bars(values: Mapping[str, float], label: str, *, most: int = 120) -> str:
+def bars(values: Mapping[str, float], label: str, *, most: int = 120, high_is_bad: bool = True) -> str:
     """A bar for each name, in the order given; a name shows when the mouse rests on its bar.
+
+    Values over twice the median are red where `high_is_bad`, else those under half of it.
 
     Edges:
         Of more than `most` names the first are drawn, and the label says so.
@@ -80,7 +91,7 @@ def bars(values: Mapping[str, float], label: str, *, most: int = 120) -> str:
     parts = []
     for k, (name, v) in enumerate(shown):
         tall = height * max(v, 0.0) / top
-        kind = "bad" if v > 2 * usual else "bar"
+        kind = "bad" if (v > 2 * usual if high_is_bad else v < usual / 2) else "bar"
         parts.append(_rect(kind, RIM + k * width, 10 + height - tall, width - 1, tall, f"{name}: {v:.3g}"))
     more = "" if len(shown) == len(values) else f"; {len(shown)} of {len(values)} shown"
     parts += [_text(2, 18, f"{top:.3g}"), _text(RIM, 126, f"{label}; median {usual:.3g}{more}")]
@@ -102,13 +113,19 @@ def camera_plots(spots: Sequence[Spot], points: Floats | None = None) -> str:
 
 
 def axes_of(poses: Floats) -> tuple[Floats, Floats, Floats]:
-    """A frame to draw poses [N,3,4] in: (across, ahead, up) float64[3] each, up being the cameras' mean upward."""
+    """A frame to draw poses [N,3,4] in: (across, ahead, up) float64[3] each.
+
+    Up is the normal of the plane that the cameras stand in, where they stand in one and it is near their mean upward;
+    else that itself; of cameras that roll, the axis along which they spread least.
+    """
     upward = -poses[:, 1, :3].mean(0)
+    centres = np.stack([-p[:, :3].T @ p[:, 3] for p in poses])
+    _, spread, axes = np.linalg.svd(centres - centres.mean(0), full_matrices=True)
+    normal = axes[2] * (1 if axes[2] @ upward >= 0 else -1)
+    rolls = np.linalg.norm(upward) < 0.3
+    flat = len(spread) == 3 and spread[2] < 0.2 * spread[1] and normal @ upward > 0.7 * np.linalg.norm(upward)
+    up = normal if rolls or flat else upward / np.linalg.norm(upward)
     forward = poses[:, 2, :3].mean(0)
-    if np.linalg.norm(upward) < 0.3:  # cameras that roll: the axis along which they spread least
-        centres = np.stack([-p[:, :3].T @ p[:, 3] for p in poses])
-        upward = np.linalg.svd(centres - centres.mean(0), full_matrices=True)[2][2]
-    up = upward / np.linalg.norm(upward)
     for sideways in (np.cross(forward, up), np.cross([1.0, 0, 0], up), np.cross([0, 1.0, 0], up)):
         if np.linalg.norm(sideways) > 0.1:
             break

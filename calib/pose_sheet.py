@@ -19,7 +19,7 @@ from spikerig.calib.aligned_scene import WORST_PX
 from spikerig.calib.arms import Arms, arms_of
 from spikerig.calib.overlay import overlay
 from spikerig.calib.plots import STYLE as PLOT_STYLE
-from spikerig.calib.plots import Spot, bars, camera_plots, histogram
+from spikerig.calib.plots import Spot, bars, camera_plots, histogram, spot_of
 from spikerig.dataset.check_look import SceneLook, Undecided, ViewLook
 from spikerig.dataset.errors import RigError
 from spikerig.dataset.images import srgb8_from_linear
@@ -64,7 +64,7 @@ def write_sheet(
             view = ViewLook(look, name)
             pictures, apart, why = _pictures(view)
             rows.append(_row(view, _fitted(pictures, budget), apart, why))
-            spots.append(_spot(view))
+            spots.append(spot_of(view.view))
             if np.isfinite(apart):
                 edges[name] = apart
             if why:
@@ -120,12 +120,6 @@ def _fitted(pictures: Mapping[str, Pixels], budget: int) -> dict[str, bytes]:
         share = max(share * min(0.95, 0.97 * (budget / total) ** 0.5), LEAST_PX / widest * 0.999)
 
 
-def _spot(look: ViewLook) -> Spot:
-    path = look.view.trajectory
-    centres = None if path is None else np.stack([-m[:, :3].T @ m[:, 3] for m in path.poses])
-    return Spot(look.name, look.view.pose.cam_from_world, look.view.split, centres)
-
-
 def _row(look: ViewLook, pictures: Mapping[str, bytes], apart: float, why: str) -> str:
     record = _table(look.scene.info.get("poses"))
     told = [look.view.split, f"exposed {look.frame.exposure_ns / 1e6:.3g} ms"]
@@ -162,7 +156,7 @@ def page(look: SceneLook, rows: list[str], spots: list[Spot], edges: Mapping[str
         histogram(list(residual.values()), "mean reprojection error, px, by view"),
         _binned(record.get("point_residuals")),
         bars(residual, "mean reprojection error, px, view by view"),
-        bars(seen, "observations in the map, view by view"),
+        bars(seen, "observations in the map, view by view", high_is_bad=False),
     ]
     title = html.escape(f"{look.file.name}: views and cameras")
     head = f"<!doctype html><meta charset=utf-8><title>{title}</title><style>{STYLE}</style>"

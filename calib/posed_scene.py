@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from spikerig.calib.gauge import Similarity, similarity
 from spikerig.calib.poses import Estimate
 from spikerig.dataset.errors import UsageError
+from spikerig.dataset.outfile import refuse_existing, stand_in
 from spikerig.dataset.scene import Points, Pose, Trajectory, View
 from spikerig.dataset.store import SceneFile, open_scene
 
@@ -50,7 +51,7 @@ def write_poses(
     Args:
         path: of the scene.
         estimate: accepted.
-        provenance: recorded as info.poses.
+        provenance: recorded as info.poses, with the SHA-256 of what the poses are made of and of the poses.
         out: another file to write; None replaces `path`, which stays as it is until the new one is whole.
         force: replace `out`.
         done: called after each view.
@@ -61,35 +62,46 @@ def write_poses(
     from spikerig.dataset.store import SceneWriter
 
     target = out or path
-    with open_scene(path) as scene:
+    if out is not None:
+        refuse_existing(out, force)
+    with open_scene(path) as scene, stand_in(target, "poses") as beside:
+        provenance = dict(provenance) | {"sha256": _hashes(scene, estimate)}
         earlier = {n: scene.view(n, spikes=False).pose.cam_from_world for n in scene.names if n in estimate.images}
         to = onto(estimate, earlier)
         placed = dict(zip(estimate.poses, to.poses(np.stack(list(estimate.poses.values()))), strict=True))
         left_out = sorted(set(estimate.images) - placed.keys())
-        beside = target.with_name(f".{target.stem}.poses.{os.getpid()}{target.suffix}")
-        if out is not None and out.exists() and not force:
-            raise UsageError("the file exists already", value=out, next="give --force to replace it")
-        try:
-            with SceneWriter(
-                beside,
-                scene.name,
-                scene.camera,
-                light_gain=scene.light_gain,
-                info={**scene.info, "poses": dict(provenance)},
-                points=_points(estimate, to) or scene.points,
-                clock=scene.clock,
-                calibration=scene.calibration,
-                truth=scene.truth,
-                keep=False,
-            ) as writer:
-                for name in scene.names:
-                    if name not in left_out:
-                        _copy(scene, writer, name, placed, estimate, to)
-                    done()
-            os.replace(beside, target)
-        finally:
-            beside.unlink(missing_ok=True)
+        with SceneWriter(
+            beside,
+            scene.name,
+            scene.camera,
+            light_gain=scene.light_gain,
+            info={**scene.info, "poses": dict(provenance)},
+            points=_points(estimate, to) or scene.points,
+            clock=scene.clock,
+            calibration=scene.calibration,
+            truth=scene.truth,
+            keep=False,
+        ) as writer:
+            for name in scene.names:
+                if name not in left_out:
+                    _copy(scene, writer, name, placed, estimate, to)
+                done()
     return {"written": str(target), "left_out": left_out, "scale": to.scale}
+
+
+def _hashes(scene: SceneFile, estimate: Estimate) -> dict[str, str]:
+    """Of the spikes and times that the poses are made of, view by view, and of the poses and the map's points."""
+    made_of, found = hashlib.sha256(), hashlib.sha256()
+    for name in sorted(set(estimate.images) & set(scene.names)):
+        view = scene.view(name)
+        made_of.update(f"{name}:{view.frame.start_ns}:{view.frame.row_ns}:{view.frame.exposure_ns}\0".encode())
+        if view.spikes is not None:
+            made_of.update(f"{view.spikes.t0_ns}:{view.spikes.rate_hz}:{view.spikes.bits.shape}\0".encode())
+            made_of.update(np.ascontiguousarray(view.spikes.bits).data)
+    for name, pose in sorted(estimate.poses.items()):
+        found.update(name.encode() + b"\0" + np.ascontiguousarray(pose, "<f8").tobytes())
+    found.update(np.ascontiguousarray(estimate.best.xyz, "<f8").tobytes())
+    return {"spikes": made_of.hexdigest(), "poses": found.hexdigest()}
 
 
 def _copy(
@@ -123,7 +135,7 @@ def trajectory_of(view: View, estimate: Estimate, to: Similarity) -> Trajectory 
     path = estimate.paths.get(view.name)
     if path is None:
         return None
-    start = view.frame.mid_ns - view.frame.exposure_ns // 2
+    start = view.mid_ns - view.frame.exposure_ns // 2
     at = start + np.rint(path.phases * view.frame.exposure_ns).astype(np.int64)
     cov = np.array(path.cov)
     cov[:, 3:, :] *= to.scale

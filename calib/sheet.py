@@ -12,17 +12,20 @@ from numpy.typing import NDArray
 
 from spikerig.calib.agree import Agreement
 from spikerig.calib.align import Aligned, Warp, rows_of_spike_px, warp_texture
+from spikerig.calib.aligned_scene import WORST_PX
 from spikerig.calib.overlay import overlay
+from spikerig.calib.plots import STYLE as PLOT_STYLE
+from spikerig.calib.plots import Spot, camera_plots, histogram
 from spikerig.calib.rig import RigCalibration
 from spikerig.calib.rolling import tfp_rows
 from spikerig.dataset.images import srgb8_from_linear
-from spikerig.dataset.scene import Pose, View
+from spikerig.dataset.scene import View
 from spikerig.dataset.texture import tfi
 
 Floats = NDArray[np.float64]
 STYLE = (
     "body{font:14px sans-serif;margin:2em;max-width:110em}table{border-collapse:collapse}td,th{padding:.2em .6em;"
-    "text-align:left;vertical-align:top}img{image-rendering:pixelated;width:22em}svg{background:#f6f6f6}"
+    "text-align:left;vertical-align:top}img{image-rendering:pixelated;width:22em}" + PLOT_STYLE
 )
 
 
@@ -48,7 +51,7 @@ def sharp_textures(view: View, calibration: RigCalibration, warp: Warp) -> dict[
     if view.spikes is None:
         return {}
     rows = rows_of_spike_px(calibration)
-    at = float(np.clip(view.spikes.tick_at(view.frame.mid_ns), 0, view.spikes.ticks))
+    at = float(np.clip(view.spikes.tick_at(view.mid_ns), 0, view.spikes.ticks))
     made = {"TFP, 32 ticks": tfp_rows(view.spikes, view.frame, rows, 0.5, 32), "TFI": tfi(view.spikes, at)}
     return {name: warp_texture(warp, texture).light for name, texture in made.items()}
 
@@ -64,14 +67,14 @@ def _png(pixels: NDArray[np.uint8]) -> bytes:
     return cv2.imencode(".png", np.ascontiguousarray(pixels[..., ::-1]))[1].tobytes()
 
 
-def page(title: str, calibration: RigCalibration, rows: Sequence[Row], poses: Sequence[Pose]) -> str:
+def page(title: str, calibration: RigCalibration, rows: Sequence[Row], spots: Sequence[Spot]) -> str:
     """The page.
 
     Args:
         title: of the scene; escaped here.
         calibration: of its rig.
         rows: views.
-        poses: of all views, for the camera plot.
+        spots: the cameras of all views.
     """
     said = [r.agreement.rms_px for r in rows if np.isfinite(r.agreement.rms_px)]
     facts = {
@@ -87,7 +90,8 @@ def page(title: str, calibration: RigCalibration, rows: Sequence[Row], poses: Se
     parts = [
         f"<!doctype html><meta charset=utf-8><title>{html.escape(title)}</title><style>{STYLE}</style>",
         f"<h1>{html.escape(title)}</h1><table>{table}</table>",
-        f"<h2>Edges apart</h2>{_histogram(said)}<h2>Cameras from above</h2>{_cameras(poses)}<h2>Views</h2><table>",
+        f"<h2>Edges apart</h2>{histogram(said, 'px, by view', bound=WORST_PX)}",
+        f"<h2>Cameras</h2>{camera_plots(spots)}<h2>Views</h2><table>",
     ]
     for r in rows:
         cells = "".join(
@@ -96,28 +100,3 @@ def page(title: str, calibration: RigCalibration, rows: Sequence[Row], poses: Se
         )
         parts.append(f"<tr><th>{html.escape(r.name)}<br>{r.agreement.rms_px:.2f} px</th>{cells}</tr>")
     return "\n".join([*parts, "</table>"]) + "\n"
-
-
-def _histogram(values: Sequence[float], bins: int = 20, most: float = 1.0) -> str:
-    counts, _ = np.histogram(np.clip(values, 0, most), bins, (0, most)) if values else (np.zeros(bins, int), None)
-    top = max(int(counts.max()), 1)
-    bars = "".join(f"<rect x={20 * k} y={100 - 100 * n / top:.0f} width=18 height={100 * n / top:.0f} fill=#47a />"
-                   for k, n in enumerate(counts))  # fmt: skip
-    return f"<svg width=420 height=120>{bars}<text x=0 y=116>0</text><text x=360 y=116>{most:g} px or more</text></svg>"
-
-
-def _cameras(poses: Sequence[Pose]) -> str:
-    """Centres and directions of view, seen along the axis that the cameras spread along least."""
-    if not poses:
-        return ""
-    centres = np.stack([p.centre for p in poses])
-    ahead = np.stack([p.cam_from_world[2, :3] for p in poses])
-    _, _, axes = np.linalg.svd(centres - centres.mean(0), full_matrices=True)
-    at, to = (centres - centres.mean(0)) @ axes[:2].T, ahead @ axes[:2].T
-    scale = 150 / max(float(np.abs(at).max()), 1e-9)
-    marks = "".join(
-        f"<line x1={x:.1f} y1={y:.1f} x2={x + 25 * u:.1f} y2={y + 25 * v:.1f} stroke=#a33 />"
-        f"<circle cx={x:.1f} cy={y:.1f} r=3 />"
-        for (x, y), (u, v) in zip(200 + scale * at, to, strict=True)
-    )
-    return f"<svg width=400 height=400>{marks}</svg>"

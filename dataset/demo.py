@@ -8,58 +8,26 @@ import shlex
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from spikerig.dataset.demo_steps import Step, steps
 from spikerig.dataset.errors import DataError, NumericsError, RigError, UsageError
 from spikerig.dataset.terminal import emit, note
-
-# The honest rows: blurry single pose, blurry with true sub-poses, the paper's loss, ours, and the sharp upper bound.
-METHODS = {
-    "demo": ("plain", "average", "spikenerf", "spike-ratio", "oracle"),
-    "chroma": ("plain", "average", "spikenerf", "spike-hybrid", "oracle"),
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """One command line of the demo: a key, its words after `spikerig`, and a line for people."""
-
-    key: str
-    words: tuple[str, ...]
-    says: str
-
-
-def steps(out: Path, seconds: dict[str, float], seed: int) -> list[Step]:
-    """The demo as data: every command line in order.
-
-    Args:
-        out: folder of the run.
-        seconds: scene name -> training seconds of each method; scenes run in this order.
-        seed: of the simulation and of training.
-    """
-    listed: list[Step] = []
-    for scene, budget in seconds.items():
-        file = str(out / f"{scene}.h5")
-        capture = ("sim", "capture", scene, "-o", file, "--seed", str(seed), "--force", "--json")
-        listed.append(Step(f"{scene}-capture", capture, f"simulate the '{scene}' capture"))
-        for method in METHODS[scene]:
-            run = str(out / f"{scene}-{method}")
-            fit = ("train", "fit", file, "--field", "splat", "--method", method, "--preset", "draft")
-            fit += ("--seconds", f"{budget:g}", "--seed", str(seed), "-o", run, "--force", "--json")
-            listed.append(Step(f"{scene}-{method}-fit", fit, f"train '{method}' on '{scene}' for {budget:g} s"))
-            score = ("train", "score", run, "--pictures", str(Path(run) / "pictures"), "--force", "--json")
-            listed.append(Step(f"{scene}-{method}-score", score, f"score '{method}' on sharp held-out views"))
-    return listed
 
 
 def demo(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the run.")] = Path("runs/demo"),
     seconds: Annotated[float, typer.Option(help="Training seconds of each method on the main scene.")] = 20.0,
     chroma_seconds: Annotated[float, typer.Option(help="The same on the chroma scene; 0 leaves it out.")] = 10.0,
+    steps_each: Annotated[
+        int | None, typer.Option("--steps", help="Train each method for so many steps instead: for a busy machine.")
+    ] = None,
+    poses: Annotated[
+        str, typer.Option(help="true, or colmap: a rig to calibrate, and poses to estimate; what both cost in dB.")
+    ] = "true",
     seed: Annotated[int, typer.Option(help="Seed of the simulation and of training.")] = 0,
     force: Annotated[bool, typer.Option("--force", help="Start over; without it an interrupted demo goes on.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
@@ -68,14 +36,22 @@ def demo(
 
     Simulates a shaken capture with a spike camera beside the RGB camera, trains the same 3D scene from the same start
     for equal seconds with and without spikes, scores sharp held-out views, and writes report.html and report.json.
+    With --poses colmap the rig's arms differ: boards are recorded and calibrated, the capture is aligned, its poses are
+    estimated from spikes; the same methods are trained on that, and on true calibration and poses.
     An interrupted demo goes on where it stopped. Exit codes: 0 ok, else that of the step that failed.
     """
     from spikerig.dataset import report
+    from spikerig.dataset.demo_poses import posed_steps
 
-    if not seconds > 0 or chroma_seconds < 0:
-        raise UsageError("training seconds must be positive", value=(seconds, chroma_seconds))
-    budgets = {"demo": seconds} | ({"chroma": chroma_seconds} if chroma_seconds else {})
-    plan = steps(out, budgets, seed)
+    if not seconds > 0 or chroma_seconds < 0 or (steps_each is not None and steps_each < 1):
+        raise UsageError("training seconds and steps must be positive", value=(seconds, chroma_seconds, steps_each))
+    if poses not in ("true", "colmap"):
+        raise UsageError("no such --poses", value=poses, expected="true or colmap")
+    if poses == "colmap":
+        plan = posed_steps(out, (seconds, steps_each or 0), seed)
+    else:
+        budgets = {"demo": seconds} | ({"chroma": chroma_seconds} if chroma_seconds else {})
+        plan = steps(out, budgets, seed, steps_each or 0)
     ledger = _ledger(out, plan, force)
     for k, step in enumerate(plan, 1):
         if step.key in ledger["done"]:

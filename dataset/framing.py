@@ -17,6 +17,7 @@ FEWEST = 16  # ticks from which anything is told
 _SLAB = 32  # ticks unpacked at once
 _DEPENDENT = 16.0  # neighbouring pixels see the same edges: that many of them count as one witness
 _BINS = 24  # of differences
+_SLIPPED = 0.999
 _NEED = 4.0  # ln of odds that a candidate must win over all the others to count, on top of their number
 
 
@@ -142,6 +143,76 @@ def row_lag(rates: Rates, least: int = 64, most: int = 2048) -> tuple[int, float
     best = int(np.argmax(inside))
     scatter = 1.4826 * float(np.median(np.abs(inside - np.median(inside))))
     return best + least, float((inside[best] - np.median(inside)) / max(scatter, 1e-12 * lags[0]))
+
+
+@dataclass(frozen=True, slots=True)
+class Slip:
+    """Ticks begin elsewhere than they did: bytes are missing that the time did not show.
+
+    Args:
+        epoch: of the stream.
+        after, before: the loss lies between these byte numbers of the epoch.
+        shift: bytes by which ticks begin later; the loss is a tick's bytes times some number, less this.
+        confidence: of the shift.
+    """
+
+    epoch: int
+    after: int
+    before: int
+    shift: int
+    confidence: float
+
+
+class Watch:
+    """Looks now and then whether ticks still begin where they did; the second witness beside bytes against time.
+
+    Args:
+        profile: of the wire.
+        every_bytes: between two looks.
+        ticks: looked at each time, at least 16.
+
+    Cost:
+        A look takes about 10 ms at 400x250: do it in the thread that writes, not in the one that reads.
+    """
+
+    def __init__(self, profile: WireProfile, every_bytes: int = 64_000_000, ticks: int = 32) -> None:
+        self._profile, self._every, self._ticks = profile, every_bytes, max(ticks, FEWEST)
+        self._epoch, self._next = -1, 0
+        self._like: Rates | None = None
+        self._seen = 0
+
+    def add(self, epoch: int, byte_index: int, data: Bytes) -> Slip | None:
+        """Bytes of an epoch, in order; blocks may be left out. A slip, where ticks are sure to begin elsewhere."""
+        size = self._profile.tick_bytes
+        if epoch != self._epoch:
+            self._epoch, self._next, self._like, self._seen = epoch, 0, None, byte_index
+        skip = -byte_index % size
+        if byte_index < self._next or len(data) < skip + self._ticks * size:
+            return None
+        self._next = byte_index + self._every
+        part = data[skip : skip + self._ticks * size]
+        return self._tags(part, byte_index) if self._profile.framing == "m1k40" else self._look(part, byte_index)
+
+    def _look(self, part: Bytes, byte_index: int) -> Slip | None:
+        rates, _ = fold(part, self._profile.tick_bytes)
+        like, seen = self._like, self._seen
+        self._like, self._seen = rates, byte_index + len(part)
+        if like is None:
+            return None
+        phase = _best(_alike(rates, like), self._profile, "like")
+        if phase.offset == 0 or phase.confidence < _SLIPPED:
+            return None
+        return Slip(self._epoch, seen, byte_index + len(part), phase.offset, phase.confidence)
+
+    def _tags(self, part: Bytes, byte_index: int) -> Slip | None:
+        start = m1k40.find_start(part[: 2 * m1k40.FRAME], sure=True)
+        seen, like = self._seen, self._like
+        if start is None:
+            return None
+        self._like, self._seen = np.array([float(start)]), byte_index + len(part)
+        if like is None or int(like[0]) == start:
+            return None
+        return Slip(self._epoch, seen, byte_index + len(part), (start - int(like[0])) % m1k40.FRAME, 1.0)
 
 
 def _seams(rates: Rates, profile: WireProfile) -> Rates:

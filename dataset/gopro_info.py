@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from spikerig.dataset.gopro_file import GoProClip, Samples, chapters, open_gopro
+from spikerig.dataset.gopro_chapter import Samples
+from spikerig.dataset.gopro_file import GoProClip, chapters, open_gopro
 from spikerig.dataset.hdf5_guard import printable
 
 SETTINGS = (
@@ -38,6 +39,7 @@ def describe_clip(path: Path) -> dict[str, Any]:
         "serial": printable(clip.serial) or None,
         "width": clip.width,
         "height": clip.height,
+        "codec": printable(clip.codec),
         "fps": clip.fps,
         "frames": clip.frames,
         "duration_s": clip.duration_s,

@@ -92,6 +92,11 @@ def _decode(file: BinaryIO, path: Path, start: int, first: int, out: Bits) -> No
             cause="the host dropped data while recording; how many ticks are missing is not in the file",
             next=f"use the ticks before {tick}, or cut the file behind it and read the rest as a recording of its own",
         )
+    unpack_blocks(data.reshape(-1), out)
+
+
+def unpack_blocks(data: Bits, out: Bits) -> None:
+    """Whole ticks of blocks, uint8[n * 128000], as packed ticks uint8[n,1000,125]; the inverse of `pack_blocks`."""
     # 500 pixels are 62.5 bytes: the second half of a row starts in the middle of byte 62
     rows = data.reshape(len(out), SIDE, 2, BLOCK)
     left, right = rows[:, :, 0, :63], rows[:, :, 1, :63]

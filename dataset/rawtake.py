@@ -34,9 +34,10 @@ class TakenView:
         start_ns, stop_ns: host time around the recording.
         epoch: of the spike stream when it ended.
         spikes: (epoch, first byte, byte past the last) of each unbroken piece of the stream.
-        clips: names of files in rgb/.
+        clips: names of files in rgb/, once they are there.
         checks: what the live checks said.
         kept: the operator (or the loop) took it.
+        clip: what the RGB camera told of its recording: name, bytes, host times around start and stop; None without.
     """
 
     name: str
@@ -47,6 +48,7 @@ class TakenView:
     clips: tuple[str, ...] = ()
     checks: Mapping[str, Any] = field(default_factory=dict)
     kept: bool = True
+    clip: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +147,7 @@ def _view(told: dict[str, Any]) -> TakenView:
         raise ValueError(f"spans of bytes run forward, not {spikes}")
     return TakenView(
         str(told["name"]), int(told["attempt"]), int(told["start_ns"]), int(told["stop_ns"]), spikes, clips,
-        dict(told["checks"]), bool(told["kept"]),
+        dict(told["checks"]), bool(told["kept"]), None if told.get("clip") is None else dict(told["clip"]),
     )  # fmt: skip
 
 
@@ -207,6 +209,14 @@ class WireBytes:
             missing.append((at, stop))
         return out, missing
 
+    def suspect(self, epoch: int, start: int, stop: int) -> list[tuple[int, int]]:
+        """Which of these bytes of an epoch may lie behind a loss that ended it."""
+        end = self.span(epoch)[1]
+        after = self.chunks.get(epoch + 1, [])
+        bytes_ = after[0].head.suspect if after else 0
+        first = max(start, end - bytes_)
+        return [(first, min(stop, end))] if first < min(stop, end) else []
+
     def _payload(self, chunk: Chunk) -> NDArray[np.uint8] | None:
         if self._held is None or self._held[0] is not chunk:
             try:
@@ -221,7 +231,7 @@ def verify_take(folder: str | Path) -> tuple[list[Finding], dict[str, Any]]:
     """Check every chunk of a take, and that no byte is missing unsaid.
 
     Returns:
-        Findings ("critical": damaged or missing unsaid; "violation": lost and said so; "suggestion": not finished),
+        Findings ("error": damaged or missing unsaid; "warning": lost and said so; "note": not finished),
         and figures: chunks, bytes, epochs, lost bytes, views kept.
 
     Raises:
@@ -231,13 +241,13 @@ def verify_take(folder: str | Path) -> tuple[list[Finding], dict[str, Any]]:
     told: list[Finding] = []
     figures = {"status": take.status, "chunks": 0, "bytes": 0, "epochs": 0, "lost_transport": 0, "lost_recorder": 0}
     if take.status != "complete":
-        told.append(Finding("status", "suggestion", "take.json", f"the take is '{take.status}'",
+        told.append(Finding("status", "note", "take.json", f"the take is '{take.status}'",
                             "spikerig rig record PLAN.toml -o TAKE --resume goes on with it"))  # fmt: skip
     last: Chunk | None = None
     for path in take.segments:
         for found in scan(path, take=take.number):
             if isinstance(found, Damage):
-                told.append(Finding("chunk", "critical", f"{path.name} at {found.offset}",
+                told.append(Finding("chunk", "error", f"{path.name} at {found.offset}",
                                     f"{found.length} bytes: {found.why}"))  # fmt: skip
                 continue
             told += _followed(last, found)
@@ -251,7 +261,7 @@ def verify_take(folder: str | Path) -> tuple[list[Finding], dict[str, Any]]:
         views = take.views()
         figures["views_kept"] = sum(v.kept for v in views)
     except RigError as error:
-        told.append(Finding("views", "critical", "views.jsonl", f"{error.what}: {error.value}"))
+        told.append(Finding("views", "error", "views.jsonl", f"{error.what}: {error.value}"))
     return told, figures
 
 
@@ -260,18 +270,18 @@ def _followed(before: Chunk | None, chunk: Chunk) -> list[Finding]:
     head, where = chunk.head, f"{chunk.path.name}, chunk {chunk.head.number}"
     told = []
     if head.lost_transport or head.lost_recorder or (head.why and head.why != "start"):
-        told.append(Finding("loss", "violation", where, f"{head.lost_transport} bytes lost on the link, "
+        told.append(Finding("loss", "warning", where, f"{head.lost_transport} bytes lost on the link, "
                             f"{head.lost_recorder} in the recorder ({head.why or 'no reason told'})"))  # fmt: skip
     if before is None:
         if head.number:
-            told.append(Finding("order", "critical", where, f"{head.number} chunks before it are missing"))
+            told.append(Finding("order", "error", where, f"{head.number} chunks before it are missing"))
         return told
     if head.number != before.head.number + 1:
-        told.append(Finding("order", "critical", where,
+        told.append(Finding("order", "error", where,
                             f"{head.number - before.head.number - 1} chunks before it are missing"))  # fmt: skip
     elif head.epoch == before.head.epoch:
         gap = head.byte_index - before.head.byte_index - before.head.payload
         said = head.lost_recorder + head.skipped
         if gap != said:
-            told.append(Finding("gap", "critical", where, f"{gap} bytes are missing before it, not {said}"))
+            told.append(Finding("gap", "error", where, f"{gap} bytes are missing before it, not {said}"))
     return told

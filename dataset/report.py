@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset import machine
+from spikerig.dataset.demo_poses import SCENES, TRUE, price, section, sentence
 from spikerig.dataset.errors import DataError, HostError
 
 OURS = ("spike-ratio", "spike-hybrid")
@@ -62,7 +63,7 @@ def build(out: Path, plan: Sequence[Any], done: dict[str, Any]) -> dict[str, Any
     Raises:
         HostError: matplotlib (extra `plot`) is not installed.
     """
-    scenes = list(dict.fromkeys(key.split("-")[0] for key in done))
+    scenes = list(dict.fromkeys(key.split("-")[0] for key in done if key.endswith("-score")))
     results = {scene: _scene(out, scene, done) for scene in scenes}
     first = results[scenes[0]]
     document = {
@@ -72,6 +73,8 @@ def build(out: Path, plan: Sequence[Any], done: dict[str, Any]) -> dict[str, Any
         "machine": machine.describe(),
         "commands": [f"spikerig {shlex.join(step.words)}" for step in plan],
     }
+    cost = price(results, done)
+    document |= {} if cost is None else {"estimated": cost}
     pictures = {scene: _figures(out, scene, results[scene]) for scene in scenes}
     (out / "picture.png").write_bytes(pictures[scenes[0]]["sheet"])
     (out / "report.html").write_text(_page(document, pictures), encoding="utf-8")
@@ -87,7 +90,7 @@ def summary(result: dict[str, Any]) -> list[str]:
             lines.append(f"  {r['plan']}")
         for name, m in r["methods"].items():
             lines.append(
-                f"  {NAMES.get(name, name):<30} {m['psnr']:6.2f} dB  luma {m['luma_psnr']:6.2f}  SSIM {m['ssim']:.4f}"
+                f"  {named(scene, name):<30} {m['psnr']:6.2f} dB  luma {m['luma_psnr']:6.2f}  SSIM {m['ssim']:.4f}"
                 f"  {m['steps']} steps in {m['train_seconds']:.0f} s"
             )
         told = (("gain_db", "gain"), ("gain_tfs_db", "TfS"), ("gain_over_average_db", "over average"))
@@ -95,8 +98,17 @@ def summary(result: dict[str, Any]) -> list[str]:
         if r["gap_to_oracle_db"] is not None:
             parts.append(f"{r['gap_to_oracle_db']:.2f} dB below the oracle")
         lines.append("  " + ", ".join(parts))
+    if "estimated" in result:
+        lines.append(sentence(result["estimated"]))
     lines.append(f"{result['seconds']:.0f} s in all; {machine.caption(result['machine'])}")
     return lines
+
+
+def named(scene: str, method: str) -> str:
+    """A method in words, on a scene."""
+    return NAMES.get(method, method).replace(
+        "true sub-poses", "found sub-poses" if scene in SCENES[1:] else "true sub-poses"
+    )
 
 
 def _scene(out: Path, scene: str, done: dict[str, Any]) -> dict[str, Any]:
@@ -117,7 +129,7 @@ def _scene(out: Path, scene: str, done: dict[str, Any]) -> dict[str, Any]:
         }
         label = score["pose_label"]
         history[name] = json.loads((out / f"{scene}-{name}" / "history.json").read_text(encoding="utf-8"))
-    plan = (done.get(f"{scene}-capture", {}).get("said") or {}).get("plan_line")
+    plan = (done.get(f"{'raw' if scene in SCENES else scene}-capture", {}).get("said") or {}).get("plan_line")
     return {"methods": methods, **gains(methods), "pose_label": label, "plan": plan, "history": history}
 
 
@@ -126,7 +138,8 @@ def _figures(out: Path, scene: str, result: dict[str, Any]) -> dict[str, bytes]:
     from spikerig.dataset.images import read_image
     from spikerig.dataset.store import open_scene
 
-    with open_scene(out / f"{scene}.h5") as file:
+    exam = TRUE if scene in SCENES else scene  # sharp truth lies on the true camera
+    with open_scene(out / f"{exam}.h5") as file:
         held_out = file.test[len(file.test) // 2]
         view = file.view(file.train[len(file.train) // 2])
         truth = _srgb(file.truth_light(held_out))
@@ -151,7 +164,7 @@ def _capture_row(view: Any, sharp: NDArray, gain: float) -> dict[str, NDArray]:
     from spikerig.dataset.texture import tfi, tfp
 
     stream = view.spikes
-    at = stream.tick_at(view.frame.mid_ns)
+    at = stream.tick_at(view.mid_ns)
     one = np.unpackbits(stream.bits[int(at)], axis=-1, bitorder="little")[:, : stream.width]
     return {
         "blurry frame": view.frame.pixels / view.frame.full,
@@ -249,6 +262,7 @@ def _img(data: bytes, kind: str, alt: str) -> str:
 def _page(result: dict[str, Any], pictures: dict[str, dict[str, bytes]]) -> str:
     """report.html; everything that came from a file is escaped."""
     esc = html.escape
+    lengths = "steps" if any(" --steps " in command for command in result["commands"]) else "seconds"
     parts = [
         "<!doctype html><html lang='en'><meta charset='utf-8'><meta name='viewport' content='width=device-width'>",
         "<title>spikerig demo</title><style>body{font:15px/1.5 system-ui,sans-serif;max-width:1100px;margin:2em auto;"
@@ -257,9 +271,11 @@ def _page(result: dict[str, Any], pictures: dict[str, dict[str, bytes]]) -> str:
         "code{font-size:12px;overflow-wrap:anywhere}.big{font-size:1.25em}</style>",
         "<h1>From photons to a sharper picture</h1>",
         "<p>A simulated rig looked at a scene while a hand shook it: one blurry picture and some 320 one-bit spike "
-        "frames a view. The same 3D model was then trained from the same start for equal seconds in each row below, "
+        f"frames a view. The same 3D model was then trained from the same start for equal {lengths} in each row below, "
         "and scored on sharp views that no row was trained on.</p>",
     ]
+    if "estimated" in result:
+        parts.append(section(result["estimated"], NAMES))
     for scene, r in result["scenes"].items():
         parts.append(f"<h2>Scene '{esc(scene)}'</h2>")
         told = [
@@ -276,7 +292,7 @@ def _page(result: dict[str, Any], pictures: dict[str, dict[str, bytes]]) -> str:
         )
         for name, m in r["methods"].items():
             parts.append(
-                f"<tr><td>{esc(str(NAMES.get(name, name)))}</td><td>{m['psnr']:.2f}</td><td>{m['luma_psnr']:.2f}</td>"
+                f"<tr><td>{esc(named(scene, str(name)))}</td><td>{m['psnr']:.2f}</td><td>{m['luma_psnr']:.2f}</td>"
                 f"<td>{m['ssim']:.4f}</td><td>{m['steps']}</td><td>{m['train_seconds']:.1f}</td></tr>"
             )
         parts.append(

@@ -146,11 +146,6 @@ class Frame:
             np.rint(self.pixels / 257).astype(np.uint8) if self.full > 255 else self.pixels.astype(np.uint8, copy=False)
         )
 
-    @property
-    def mid_ns(self) -> int:
-        """Mid-exposure of the middle sensor row."""
-        return self.start_ns + self.exposure_ns // 2 + self.row_ns * (self.pixels.shape[0] // 2)
-
 
 @dataclass(frozen=True, slots=True)
 class Points:
@@ -199,6 +194,31 @@ class View:
             raise DataError("sensor_row and valid must have the frame's size", value=self.name, expected=str(shape))
         if self.split not in ("train", "test"):
             raise DataError("a view is for train or test", value=self.split)
+
+    @property
+    def middle_row(self) -> float:
+        """The sensor row that the picture's middle row was read at, which a crop or a lens moves.
+
+        Edges:
+            Where a warp bends rows it is the median over the middle row's valid pixels; over all valid ones where that
+            row has none; the picture's own middle where nothing is valid.
+        """
+        middle = len(self.sensor_row) // 2
+        for rows, valid in ((self.sensor_row[middle], self.valid[middle]), (self.sensor_row, self.valid)):
+            if valid.any():
+                return float(np.median(rows[valid]))
+        return float(middle)
+
+    @property
+    def mid_ns(self) -> int:
+        """Mid-exposure of the picture's middle row, on the frame's clock."""
+        return self.instant_ns(0.5)
+
+    def instant_ns(self, phase: float) -> int:
+        """Nanoseconds at a fraction of the exposure of the picture's middle row (a global shutter's every row)."""
+        f = self.frame
+        late = f.row_ns * self.middle_row if f.row_ns else 0.0
+        return f.start_ns + round(late + phase * f.exposure_ns)
 
 
 @dataclass(frozen=True, slots=True)

@@ -85,6 +85,12 @@ class SceneFile:
         self._file.close()
 
     @property
+    def sha256(self) -> str | None:
+        """Checksum of the whole content, as stored; None in an unfinished file."""
+        with hdf5_faults(self.path):
+            return stored_digest(self._file) or None
+
+    @property
     def points(self) -> Points | None:
         """The sparse points, None if there are none."""
         with hdf5_faults(self.path):
@@ -288,7 +294,7 @@ class SceneFile:
                 "truth": self.truth_label or None,
                 "clock": self.clock is not None,
                 "calibration": self.calibration is not None,
-                "sha256": stored_digest(self._file) or None,
+                "sha256": self.sha256,
                 "info": self.info,
             }
 

@@ -12,6 +12,8 @@ import typer
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.terminal import Progress, emit, note
 
+RigName = Annotated[str, typer.Option("--rig", help="Arms that differ: splitter (RGB mirrored, off axis; a barrel).")]
+
 
 def cores(asked: int) -> int:
     """How many processes to start: as asked, or for 0 one a core that this process may use."""
@@ -25,6 +27,7 @@ def capture(
     out: Annotated[Path, typer.Option("-o", "--out", help="The scene file to write (.h5).")],
     seed: Annotated[int | None, typer.Option(help="Of shake, noise and points, in place of the scene's.")] = None,
     views: Annotated[int | None, typer.Option(help="Viewpoints on the same arc, in place of the scene's.")] = None,
+    rig: RigName = "",
     workers: Annotated[int, typer.Option(help="Processes; 0: one a core. The bits do not depend on it.")] = 0,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
@@ -37,7 +40,7 @@ def capture(
     from spikerig.rigctl.sim.spec import load_scene_toml, with_changes
 
     began = time.monotonic()
-    spec = with_changes(load_scene_toml(scene), seed=seed, views=views)
+    spec = with_changes(load_scene_toml(scene), seed=seed, views=views, rig=rig)
     bar = Progress(f"simulating '{spec.name}'", spec.orbit.views, "views")
     told = play(spec, out, workers=cores(workers), force=force, done=bar.step)
     tell("spikerig.sim.capture/1", out, told, began, as_json)

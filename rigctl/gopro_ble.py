@@ -58,6 +58,11 @@ class Assembler:
     _got: bytearray | None = None
     _next: int = 0
 
+    @property
+    def underway(self) -> bool:
+        """A message has begun and is not whole yet."""
+        return self._got is not None
+
     def feed(self, packet: bytes) -> bytes | None:
         """Take a packet; the message, once it is whole."""
         if not packet:

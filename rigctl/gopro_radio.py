@@ -199,7 +199,7 @@ class Radio:
             message = self._take(*note)
             if message and note[0] == wanted and message[0] == number:
                 return message[1:], ""
-            if ears.broken > broken:
+            if ears.broken > broken and not ears.underway:
                 return None, ears.why
         return None, f"silence for {_WAIT_NS / 1e9:g} s"
 
@@ -208,6 +208,7 @@ class Radio:
         until = self.host.now_ns() + _WAIT_NS
         while self.host.now_ns() < until and (note := self._linked().receive(_QUIET_NS)) is not None:
             self._take(*note)
+        self._heard = {characteristic: Assembler() for characteristic in self._heard}
 
     def _take(self, characteristic: str, packet: bytes) -> bytes | None:
         ears = self._heard.get(characteristic)

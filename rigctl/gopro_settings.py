@@ -60,7 +60,7 @@ DEFAULTS: dict[str, str] = {
     "hindsight": "off", "auto_off": "never", "max_lens": "off", "anti_flicker": "60", "lens": "wide",
     "resolution": "1080", "fps": "120", "hypersmooth": "off", "gps": "off", "protune": "on", "shutter": "1/480",
     "iso_max": "400", "iso_min": "400", "white_balance": "5500", "colour": "flat", "sharpness": "low", "ev": "0",
-    "bit_rate": "high", "codec": "hevc",
+    "bit_rate": "high", "codec": "avc",
 }  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from spikerig.dataset.errors import DeviceError
 from spikerig.rigctl.gopro_http import Dark, Web
 from spikerig.rigctl.gopro_radio import Radio
-from spikerig.rigctl.gopro_settings import DEFAULTS, Setting, in_order
+from spikerig.rigctl.gopro_settings import BY_NAME, DEFAULTS, Setting, in_order
 from spikerig.rigctl.gopro_watch import Watch
 
 
@@ -24,6 +24,7 @@ def settle(watch: Watch, settings: Mapping[str, Any]) -> dict[str, dict[str, str
         DeviceError: a documented setting is refused or reads back otherwise; the camera is busy or gone.
     """
     chosen = in_order(DEFAULTS | dict(settings))
+    _stop_hindsight(watch)
     watch.until_idle("settings")
     done: dict[str, dict[str, str]] = {"set": {}, "not_set": {}, "file_tells": {}}
     for setting, option, value in chosen:
@@ -37,6 +38,14 @@ def settle(watch: Watch, settings: Mapping[str, Any]) -> dict[str, dict[str, str
         watch.until_idle(setting.name)
     _read_back(watch, done["set"], chosen)
     return done
+
+
+def _stop_hindsight(watch: Watch) -> None:
+    """HindSight encodes all the time: until it is off, HTTP is dark and every other setting is refused."""
+    hindsight = BY_NAME["hindsight"]
+    off = hindsight.options["off"]
+    if watch.radio is not None and watch.radio.settings([hindsight.number]).get(hindsight.number) != off:
+        watch.radio.set(hindsight.number, off)
 
 
 def _refused(web: Web, radio: Radio | None, setting: Setting, value: int) -> DeviceError | None:

@@ -5,12 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spikerig.dataset.clocktime import NS
 
-_BIN_BLOCKS = 8  # blocks of which the most punctual one speaks
+_KNOWN_S = 2.0  # of pairs' distances together, from which a rate is told
+_BIN_BLOCKS = 4  # blocks of which the most punctual one speaks
 _BINS = 64  # kept
-_SETTLED = 3  # blocks in a row that must agree before a loss is told
+_SETTLED = 4  # blocks in a row that must agree before a loss is told
+_QUICK = 0.9  # of the time in which the camera makes a block's bytes
+_ODD = 1e-3  # no crystal is so far off: a rate like that is not taken over
 _SPREAD = 64  # blocks of which the scatter is known
 
 
@@ -52,7 +56,7 @@ class Pace:
     Edges:
         A loss below the scatter of the host's stamps (some bytes when emulated, a few kB on a busy host) is not seen:
         the tick phase shows it (`framing.find_phase`). A camera that is slower than the tolerance allows is reported as
-        losing all the time: its profile is wrong.
+        losing all the time, and one that is faster hides losses: `measured` tells, and the profile is wrong.
     """
 
     def __init__(self, nominal: float, tolerance_ppm: float = 200.0) -> None:
@@ -60,17 +64,31 @@ class Pace:
         self._rate = self.nominal
         self._drift = self.tolerance  # of the rate in use, relative
         self._rate_told: Rate | None = None
+        self._piece = 0  # of the record that is whole: between losses
+        self._bins: list[tuple[int, int, int]] = []  # piece, time, bytes
+        self._jumps: list[float] = []  # of the lag from block to block: how punctual the host is
         self.begin()
 
-    def begin(self) -> None:
-        """A new epoch; the rate stays known."""
-        self._at: tuple[int, int] | None = None  # the most punctual moment: time and bytes
+    def begin(self, at_ns: int | None = None) -> None:
+        """A new epoch; the rate and the host's punctuality stay known.
+
+        Args:
+            at_ns: when nothing waited any more: from then on bytes are counted. None: from the first block's end.
+        """
+        # the most punctual moment: time and bytes
+        self._at: tuple[int, int] | None = None if at_ns is None else (at_ns, 0)
         self._lags: list[float] = []
-        self._bins: list[tuple[int, int]] = []
+        self._piece += 1
         self._bin: list[tuple[float, int, int]] = []
-        self._calm: list[float] = []
         self.sure_bytes = 0  # of this epoch: all before was in time
         self.total = 0
+
+    def split(self, lapse: Lapse) -> None:
+        """A new epoch right after a loss that was seen from the time: expectations go on, less what is missing."""
+        at, total = self._at, self.total
+        self.begin()
+        if at is not None:
+            self._at = (at[0], at[1] - total - lapse.bytes)
 
     def lag(self, now_ns: int, total: int) -> float:
         """Bytes that should have come by now and did not."""
@@ -78,11 +96,11 @@ class Pace:
             return 0.0
         return self._rate * (now_ns - self._at[0]) / NS - (total - self._at[1])
 
-    def add(self, after_ns: int, count: int) -> Lapse | None:
-        """A block came back at `after_ns` with `count` bytes.
+    def add(self, before_ns: int, after_ns: int, count: int) -> Lapse | None:
+        """A block asked for at `before_ns` came back at `after_ns` with `count` bytes.
 
         Returns:
-            A loss, once it is certain; the caller then begins a new epoch.
+            A loss, once it is certain; the caller then goes on with `split`.
         """
         self.total += count
         if self._at is None:
@@ -91,16 +109,23 @@ class Pace:
         if lag < 0:  # more punctual than ever
             self._at = (after_ns, self.total)
             lag = 0.0
-        self._lags = [*self._lags[1 - _SETTLED :], lag]
         allowed = self._allowed(after_ns)
         if lag <= allowed:
             self.sure_bytes = self.total
-            self._calm = [*self._calm[1 - _SPREAD :], lag]
-        self._fit(lag, after_ns)
-        lowest = min(self._lags)
+            if self._lags:  # of blocks that waited for the camera
+                self._jumps = [*self._jumps[1 - _SPREAD :], abs(lag - self._lags[-1])]
+        self._lags = [*self._lags[1 - _SETTLED :], lag]
+        self._fit(lag, after_ns, lag <= allowed)
+        if (
+            after_ns - before_ns
+        ) * self._rate < _QUICK * count * NS:  # faster than they are made: a backlog is read off
+            self._lags = []
+        lowest = min(self._lags, default=0.0)
         if len(self._lags) < _SETTLED or lowest <= allowed:
             return None
-        if self._lags[-1] < self._lags[0] - max(allowed / 4, 0.02 * count):  # a backlog that is being read off
+        if self._lags[-1] < self._lags[0] - max(
+            allowed / 4, 0.02 * count
+        ):  # a backlog, on a link that is hardly faster
             return None
         return Lapse(round(lowest), self.total - self.sure_bytes)
 
@@ -114,29 +139,43 @@ class Pace:
 
     def _allowed(self, now_ns: int) -> float:
         """Lag that is no loss: scatter of the stamps, and what the rate may be off since the punctual moment."""
-        assert self._at is not None
-        calm = np.array(self._calm) if len(self._calm) >= 8 else np.array([0.0, self._rate * 200e-6])
-        scatter = float(np.quantile(calm, 0.9) - calm.min())
-        return 64 + 4 * scatter + self._drift * self._rate * (now_ns - self._at[0]) / NS
+        since_ns = self._at[0] if self._at else now_ns
+        known = len(self._jumps) >= 8
+        scatter = float(np.quantile(self._jumps, 0.75)) if known else self._rate * 200e-6
+        return 64 + 6 * scatter + self._drift * self._rate * (now_ns - since_ns) / NS
 
-    def _fit(self, lag: float, after_ns: int) -> None:
-        self._bin.append((lag, after_ns, self.total))
+    def _fit(self, lag: float, after_ns: int, in_time: bool) -> None:
+        if in_time:
+            self._bin.append((lag, after_ns, self.total))
         if len(self._bin) < _BIN_BLOCKS:
             return
         _, at, total = min(self._bin)
         self._bin = []
-        self._bins = [*self._bins[1 - _BINS :], (at, total)]
-        t = np.array([b[0] - self._bins[0][0] for b in self._bins], np.float64) / NS
-        y = np.array([b[1] - self._bins[0][1] for b in self._bins], np.float64)
-        if len(t) < 6 or t[-1] < 0.4:
-            return
+        self._bins = [*self._bins[1 - _BINS :], (self._piece, at, total)]
+        piece, when, count = np.array(self._bins, np.int64).T
+        t, y = (when - when[0]) / NS, (count - count[0]).astype(np.float64)
         i, j = np.triu_indices(len(t), 1)
-        far = t[j] - t[i] > 0.3 * t[-1]
-        slope = float(np.median((y[j] - y[i])[far] / (t[j] - t[i])[far]))
-        rest = y - slope * t
-        sigma = 1.5 * float(np.median(np.abs(rest - np.median(rest)))) / t[-1] + 2.0 / t[-1]
-        self._rate_told = Rate(slope, float(sigma), float(t[-1]), (slope / self.nominal - 1) * 1e6)
-        if slope > self.nominal * (1 - self.tolerance):
-            self._rate, self._drift = slope, max(4 * sigma / slope, 0.02e-6)
-            k = int(np.argmax(rest))  # the most punctual one by the new rate
-            self._at = (self._bins[k][0], self._bins[k][1])
+        use = (piece[i] == piece[j]) & (t[j] - t[i] > 0.02)
+        if np.sum((t[j] - t[i])[use]) < _KNOWN_S:
+            return
+        slope = _weighted_median(((y[j] - y[i]) / (t[j] - t[i] + 1e-12))[use], (t[j] - t[i])[use] ** 2)
+        rest, lever = y - slope * t, np.zeros(len(t))
+        for k in np.unique(piece):
+            mine = piece == k
+            rest[mine] -= np.median(rest[mine])
+            lever[mine] = t[mine] - t[mine].mean()
+        sigma = (1.5 * float(np.median(np.abs(rest))) + 1.0) / float(np.sqrt(np.sum(lever**2)))
+        if 4 * sigma > _ODD * slope:
+            return
+        self._rate_told = Rate(slope, sigma, float(t[-1]), (slope / self.nominal - 1) * 1e6)
+        if abs(slope / self.nominal - 1) < _ODD:
+            self._rate, self._drift = slope, min(max(4 * sigma / slope, 0.02e-6), self.tolerance)
+            mine = np.flatnonzero(piece == self._piece)
+            k = mine[np.argmax((y - slope * t)[mine])]  # the most punctual one by the new rate
+            self._at = (int(when[k]), int(count[k]))
+
+
+def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
+    order = np.argsort(values)
+    reach = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(reach, reach[-1] / 2)])

@@ -52,3 +52,45 @@ def plan(
     note("nothing speaks against it" if not told.cannot else f"{len(told.cannot)} reasons against it")
     if told.cannot:
         raise typer.Exit(1)
+
+
+def record(
+    plan: Annotated[str, PLAN],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the take; it is made.")],
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a take where it ended.")] = False,
+    emulate: Annotated[
+        str, typer.Option(help="An emulated rig in place of the real one: a file (TOML), or demo.")
+    ] = "",
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
+) -> None:
+    """Record a take, viewpoint by viewpoint: exit 1 where some are poor or left, 130 after Ctrl-C; --resume goes on."""
+    from spikerig.dataset.errors import UsageError
+    from spikerig.rigctl.forecast import forecast
+    from spikerig.rigctl.open_rig import open_rig
+    from spikerig.rigctl.operator import Nobody, Person
+    from spikerig.rigctl.record import record as run
+    from spikerig.rigctl.take_plan import load_plan
+
+    read = load_plan(plan)
+    told = forecast(read, out)
+    if told.cannot:
+        raise UsageError("this plan cannot be recorded here", value="; ".join(r["what"] for r in told.cannot),
+                         next=f"spikerig rig plan {plan} -o {out}")  # fmt: skip
+    rig = open_rig(read, out, emulate, resume)
+    try:
+        with rig.host.worker("main"):
+            tally = run(read, rig, out, Person() if read.advance == "prompt" else Nobody(), resume=resume)
+    finally:
+        rig.close()
+    if as_json:
+        emit("spikerig.rig.record/1", {"take": str(out), **asdict(tally)})
+    note(
+        f"{out}: {tally.kept} of {tally.viewpoints} viewpoints, {tally.bytes / 1e9:.2f} GB in {tally.seconds:.0f} s, "
+        f"{tally.lost_ticks} ticks lost, ring at most {tally.high_water} of {tally.slots}; {tally.status}"
+    )
+    for name, amiss in tally.poor.items():
+        note(f"  poor: {name}: {'; '.join(amiss)}")
+    if tally.status != "complete":
+        note(f"  go on: spikerig rig record {plan} -o {out} --resume")
+    if tally.poor or tally.status != "complete":
+        raise typer.Exit(1)

@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import xxhash
 from numpy.typing import NDArray
 
-from spikerig.dataset.errors import DeviceError, HostError, RigError
-from spikerig.dataset.segments import PAGE, STAMP, ChunkHead, chunk_ticks, encode_head, padded, thinned
+from spikerig.dataset.errors import DeviceError, RigError
+from spikerig.dataset.segments import PAGE, ChunkHead, chunk_ticks, padded
 from spikerig.rigctl.devices import Block, SpikeSource
+from spikerig.rigctl.drain import Drain
 from spikerig.rigctl.host import Host
 from spikerig.rigctl.ring import Ring, Slot, ring_slots
 from spikerig.rigctl.segment_writer import SegmentWriter
 
 TIMEOUT_NS = 100_000_000  # of one read
 SILENT_NS = 2_000_000_000  # without a byte for so long, the camera is said to be silent
+MARK_NS = 50_000_000  # the stream's progress is noted once in so long
 WARN_AT = (0.5, 0.75)  # of the ring
 SLOW = "the disk is too slow: recording stopped before anything was lost"
 Event = Callable[[Mapping[str, Any]], None]
@@ -73,7 +74,7 @@ class Recorder:
         folder: of the segments.
         host: the clock.
         take: number of the take, for the chunk headers.
-        first: number of the first chunk.
+        first, first_epoch: numbers of the first chunk and of the source's first epoch.
         options: how.
         acknowledged: called by the writing thread when a chunk is on disk: its head, file and offset. From then on a
             kill of this program cannot take it back; a power cut can until `RecorderState.synced` counts it.
@@ -94,6 +95,7 @@ class Recorder:
         take: int,
         *,
         first: int = 0,
+        first_epoch: int = 0,
         options: RecorderOptions | None = None,
         acknowledged: Callable[[ChunkHead, Path, int], None] = lambda head, path, offset: None,
         event: Event = lambda told: None,
@@ -108,17 +110,22 @@ class Recorder:
             ticks / profile.rate_hz, self.options.ring_s, PAGE + padded(self.payload), self.options.memory
         )
         self.ring = Ring(self.payload, slots)
-        self._acknowledged, self._event = acknowledged, event
-        self._writer = SegmentWriter(
+        self._event = event
+        writer = SegmentWriter(
             folder, host, lambda kind, words: self._tell(kind, words=words), segment_bytes=self.options.segment_bytes,
             sync_s=self.options.sync_s, direct=self.options.direct,
         )  # fmt: skip
-        self._number = first
+        self._drain = Drain(
+            self.ring, writer, take, first, self.tick_bytes, acknowledged, self._give_up, self._fail
+        )  # fmt: skip
+        self._base: int | None = None  # added to the source's epochs
+        self._first_epoch = first_epoch
+        self._progress: list[tuple[int, int, int]] = []  # of each stretch of time the most punctual transfer
         self._lock = threading.Lock()
         self._want = False  # what keep() and pause() ask for
         self._keeping = False
         self._trouble = ""
-        self._stop = self._broken = False
+        self._stop = False
         self._slot: Slot | None = None
         self._pending = Slot(memoryview(b""), np.zeros(0, np.uint8))  # losses that the next chunk will tell
         self._epoch, self._next = -1, 0  # the byte expected next
@@ -130,13 +137,12 @@ class Recorder:
         self._peek: tuple[NDArray[np.uint8], list[int]] | None = None
         self._ready = threading.Event()
         self._read = threading.Thread(target=self._reading, name="spike-reader", daemon=True)
-        self._write = threading.Thread(target=self._writing, name="spike-writer", daemon=True)
 
     def start(self) -> None:
         """Start the source and both threads; nothing is kept yet."""
         self.source.start()
         self._last_ns = self.host.now_ns()
-        self._write.start()
+        self._drain.start()
         self._read.start()
         self._ready.wait()  # emulated time must not run before the reader takes part
 
@@ -159,7 +165,7 @@ class Recorder:
         while self._keeping and self._read.is_alive():
             self.host.sleep_until(self.host.now_ns() + 1_000_000)
         self.ring.drained()  # emulated time stands still meanwhile: the writer needs none
-        self._writer.sync()
+        self._drain.writer.sync()
         return [(e, a, b) for e, a, b in self._spans if b > a]
 
     def peek(self, ticks: int, timeout_ns: int = 2_000_000_000) -> NDArray[np.uint8] | None:
@@ -177,15 +183,30 @@ class Recorder:
 
     def state(self) -> RecorderState:
         """Where it stands."""
-        ring = self.ring
+        ring, drain = self.ring, self._drain
         return RecorderState(
-            self._keeping, self._epoch, self._seen, self._kept, self._number, self._writer.synced, ring.fill,
+            self._keeping, self._epoch, self._seen, self._kept, drain.number, drain.writer.synced, ring.fill,
             ring.slots, ring.high_water, self._lost_transport, self._lost_recorder, self._trouble,
         )  # fmt: skip
 
     def position(self) -> tuple[int, int]:
-        """Epoch, and bytes seen of it."""
+        """The epoch, and bytes that came of it."""
         return self._epoch, self._next
+
+    @property
+    def dead(self) -> bool:
+        """No byte will be read or written any more: the reader ended, or the disk failed."""
+        return bool(self._trouble) and self._trouble != SLOW
+
+    def progress(self) -> list[tuple[int, int, int]]:
+        """New since the last call: (epoch, bytes of it, host time after), the most punctual transfer of each 50 ms."""
+        with self._lock:
+            told, self._progress = self._progress[:-1], self._progress[-1:]
+        return told
+
+    def device_ns(self, byte: int) -> int:
+        """The spike camera's own time at a byte of an epoch: nominal, whatever the rate truly is."""
+        return round(byte / self.tick_bytes / self.source.profile.rate_hz * 1e9)
 
     def close(self) -> None:
         """Stop the source, write what is there, close the files; may be called twice.
@@ -198,10 +219,7 @@ class Recorder:
             with self.host.aside():
                 self._read.join()
         self.source.stop()
-        self.ring.close()
-        if self._write.is_alive():
-            self._write.join()
-        self._writer.close()
+        self._drain.close()
 
     # the reading thread
 
@@ -231,7 +249,12 @@ class Recorder:
             self._tell("silent", words="no byte came from the spike camera for 2 s")
 
     def _take(self, block: Block) -> None:
+        if self._base is None:
+            self._base = self._first_epoch - block.epoch
+        if self._base:
+            block = replace(block, epoch=block.epoch + self._base)
         self._last_ns, self._silent = block.after_ns, False
+        self._note(block)
         data, at = block.data, block.byte_index
         self._seen += len(data)
         if block.epoch != self._epoch or at != self._next:
@@ -250,6 +273,17 @@ class Recorder:
             self._keep(data, at, block)
         else:
             self._pending.skipped += len(data)
+
+    def _note(self, block: Block) -> None:
+        end = block.byte_index + len(block.data)
+        with self._lock:
+            if self._progress:
+                epoch, byte, at = self._progress[-1]
+                if epoch == block.epoch and at // MARK_NS == block.after_ns // MARK_NS:
+                    if self.device_ns(end) - block.after_ns <= self.device_ns(byte) - at:
+                        return
+                    self._progress.pop()
+            self._progress.append((block.epoch, end, block.after_ns))
 
     def _new_epoch(self, block: Block) -> None:
         self._hand_over()
@@ -340,46 +374,10 @@ class Recorder:
             wanted[state[0] : state[0] + n] = data[:n]
             state[:] = state[0] + n, block.epoch, block.byte_index + len(block.data)
 
-    # the writing thread
-
-    def _writing(self) -> None:
-        while (slot := self.ring.next()) is not None:
-            try:
-                if self._broken:
-                    self._give_up(slot)
-                else:
-                    self._put(slot)
-            except HostError as error:
-                self._broken = True
-                self._give_up(slot)
-                self._fail(error.what, error)
-            except Exception as error:  # a fault of ours must not leave a silent thread behind
-                self._broken = True
-                self._give_up(slot)
-                self._fail("the segment writer broke", error)
-            finally:
-                self.ring.done(slot)
-
-    def _put(self, slot: Slot) -> None:
-        stored = padded(slot.used)
-        slot.room[slot.used : stored] = 0
-        stamps = thinned(np.array(slot.stamps, STAMP))
-        head = ChunkHead(
-            self.take, self._number, slot.epoch, slot.byte_index, self.tick_bytes, slot.stamps[0][1],
-            slot.stamps[-1][2], slot.lost_transport, slot.lost_recorder, slot.skipped, slot.why, slot.suspect,
-            slot.used, xxhash.xxh3_64_intdigest(slot.room[: slot.used].data),
-        )  # fmt: skip
-        slot.page[:PAGE] = encode_head(head, stamps)
-        path, offset = self._writer.write(slot.page[: PAGE + stored])
-        self._number += 1
-        self._acknowledged(head, path, offset)
-
     def _give_up(self, slot: Slot) -> None:
         self._lost_recorder += slot.used
         self._tell("recorder", epoch=slot.epoch, byte_index=slot.byte_index, lost_bytes=slot.used,
                    words="LOST: these bytes could not be written")  # fmt: skip
-
-    # both
 
     def _fail(self, words: str, error: Exception) -> None:
         self._set_trouble(words)

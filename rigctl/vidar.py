@@ -70,9 +70,9 @@ class VidarSource:
         self.pace = Pace(profile.bytes_s)
         self.epoch = -1
         self._turn, self._index, self._streaming = 0, 0, False
-        self._why, self._due, self._suspect, self._failed = "", 0, 0, 0
-        self._heard_ns = self._gone_ns = 0
-        self._retry = 0
+        self._loss: tuple[int, str, int] = (0, "", 0)  # lost, why, suspect: for the next block to tell
+        self._trouble, self._failed, self._silent = "", 0, False
+        self._heard_ns = self._retry = 0
 
     def start(self) -> None:
         """Begin the stream: flush, stream, throw old bytes away until they come at the camera's own pace."""
@@ -82,12 +82,12 @@ class VidarSource:
         try:
             self._begin()
         except OSError as error:
-            if fault_of(error) not in (Fault.STALL, Fault.TIMEOUT):
+            if fault_of(error) is not Fault.STALL:
                 raise self._refused(error) from error
-            self._clear(error)
+            self._device.clear_halt(DATA_IN)  # left over from a run that died
             self._begin()
-        self._streaming, self._why = True, ""
-        self._new_epoch()
+        self._streaming, self._loss, self._heard_ns = True, (0, "", 0), self._host.now_ns()
+        self._new_epoch("")
 
     def read(self, timeout_ns: int) -> Block | None:
         """The next bytes; see `SpikeSource.read`."""
@@ -130,91 +130,86 @@ class VidarSource:
 
     # -- the stream -------------------------------------------------------------------------------------------------
     def _block(self, count: int, before: int, after: int) -> Block:
-        """Bytes that came, with their epoch; losses known by now are told with them."""
-        self._failed, self._heard_ns = 0, after
-        lost, why, suspect = 0, self._why, 0
-        if why:
-            lost, suspect = self._settle(after, count)
+        """Bytes that came, with what was lost before them."""
+        self._failed, self._retry, self._heard_ns = 0, 0, after
         data = self._views[self._turn][:count]
         self._turn ^= 1
-        block = Block(data, self.epoch, self._index, before, after, lost, why, suspect)
-        self._index += count
-        lapse = self.pace.add(after, count)
-        if lapse is not None:  # seen now: this block still belongs to the old epoch, at its suspect end
-            self._why, self._due = "rate", lapse.bytes
-            self._suspect = lapse.suspect
+        block = Block(data, self.epoch, self._index, before, after, *self._loss)
+        self._index, self._loss = self._index + count, (0, "", 0)
+        lapse = self.pace.add(before, after, count)
+        if lapse is not None:  # known from now on: this block still belongs to the old epoch, at its suspect end
+            self._loss = (lapse.bytes, "rate", lapse.suspect)
+            self.epoch, self._index = self.epoch + 1, 0
+            self.pace.split(lapse)
         return block
 
-    def _settle(self, after: int, count: int) -> tuple[int, int]:
-        """A loss is known and bytes come again: how many are missing, and how many before it are in doubt."""
-        if self._why == "rate":
-            lost, suspect = self._due, self._suspect
-        else:
-            lost = max(0, round(self.pace.lag(after, self.pace.total + count)))
+    def _new_epoch(self, why: str) -> None:
+        """The stream runs again, and nothing waits: count from here; the next block tells what is missing."""
+        now = self._host.now_ns()
+        lost, first, suspect = self._loss
+        lost += max(0, round(self.pace.lag(now, self.pace.total))) if why else 0
+        if self._index or not why:  # else the epoch before had not a single byte
+            self.epoch, self._index = self.epoch + 1, 0
             suspect = self.pace.doubtful()
-        self._why = ""
-        self._new_epoch()
-        return lost, suspect
-
-    def _new_epoch(self) -> None:
-        self.epoch += 1
-        self._index = 0
-        self.pace.begin()
-        self._heard_ns = self._host.now_ns()
+        self._loss = (lost, first or why, suspect)
+        self.pace.begin(now)
 
     def _transfer(self, buffer: Any, left_ns: int) -> int:
-        """One bulk read: how many bytes came; errors are mapped, losses noted in `_why`."""
+        """One bulk read: how many bytes came. After an error the stream is caught up with, in a new epoch."""
         wait_ms = max(1, -(-max(left_ns, 0) // 1_000_000))  # 0 would mean for ever
         try:
-            return self._device.read(DATA_IN, buffer, wait_ms)
+            if self._silent:
+                self._revive()
+            else:
+                return self._device.read(DATA_IN, buffer, wait_ms)
         except OSError as error:
-            fault = fault_of(error)
-            if fault is Fault.TIMEOUT:
-                self._silent()
-            else:  # whatever the transfer had carried is gone with the error
-                self._failed += fault is not Fault.AGAIN
-                self._why = fault.value
-                if fault is Fault.STALL:
-                    self._clear(error)
-                elif fault in (Fault.GONE, Fault.BUSY, Fault.DENIED) or self._failed >= _TRIES:
-                    self._lose()
-            return 0
+            self._mend(error)
+        return 0
 
-    def _clear(self, error: OSError) -> None:
-        """End a stall, if that is what the error was."""
-        if fault_of(error) is not Fault.STALL:
+    def _mend(self, error: OSError) -> None:
+        """What an error of the data pipe asks for; whatever the transfer had carried is gone with it."""
+        fault = fault_of(error)
+        if fault is Fault.TIMEOUT:
+            self._silent = self._host.now_ns() - self._heard_ns >= _SILENCE_NS
+            return
+        self._failed, self._trouble = self._failed + 1, fault.value
+        if fault in (Fault.GONE, Fault.BUSY, Fault.DENIED) or self._failed >= _TRIES:
+            self._lose()
             return
         try:
-            self._device.clear_halt(DATA_IN)
+            if fault is Fault.STALL:
+                self._device.clear_halt(DATA_IN)
+            self._drain()
+            self._new_epoch(self._trouble)
         except OSError as again:
-            self._why = fault_of(again).value
-            self._lose()
-            return
-        if self._failed >= _TRIES:
-            self._lose()
+            self._mend(again)
 
-    def _silent(self) -> None:
-        """Nothing came in time: after a while the stream is begun again, in the end given up."""
-        now = self._host.now_ns()
-        if now - self._heard_ns < _SILENCE_NS:
-            return
-        if now - self._heard_ns > self._patience:
+    def _revive(self) -> None:
+        """Nothing came for long: begin the stream again; give up in the end."""
+        still = self._host.now_ns() - self._heard_ns
+        if still > self._patience:
             raise DeviceError(
-                "the spike camera says nothing",
-                value=f"{self.facts.serial} at {self.facts.address}, {(now - self._heard_ns) / NS:.1f} s",
-                cause="its sensor is not running, or its bridge hangs", next="power it off and on; spikerig rig probe",
+                "the spike camera says nothing", value=f"{self._wanted}, {still / NS:.1f} s",
+                cause="its sensor is not running, or its bridge hangs",
+                next="power it off and on; spikerig rig probe",
             )  # fmt: skip
-        self._why = "silence"
-        try:
-            self._send((*stop_commands(), *start_commands()))
-        except OSError as error:
-            self._why = fault_of(error).value
-            self._lose()
+        self._send((*stop_commands(), *start_commands()))
+        if self._drain():
+            self._silent = False
+            self._new_epoch("silence")
 
     def _begin(self) -> None:
+        """Flush, stream, and catch up."""
         self._send(start_commands())
+        self._drain()
+
+    def _drain(self) -> bool:
+        """Throw bytes away until they come at the camera's own pace: nothing waits any more. False: they do not come.
+
+        What overflowed while nobody read lies somewhere in what waited: kept, it would be a gap inside an epoch.
+        """
         end = self._host.now_ns() + _DRAIN_NS
-        calm = 0
+        calm, came = 0, False
         while calm < 2 and self._host.now_ns() < end:
             before = self._host.now_ns()
             try:
@@ -222,9 +217,11 @@ class VidarSource:
             except OSError as error:
                 if fault_of(error) is not Fault.TIMEOUT:
                     raise
-                break
+                continue
+            came = True
             took = (self._host.now_ns() - before) / NS
             calm = calm + 1 if count < 1.1 * took * self.profile.bytes_s else 0
+        return came
 
     def _send(self, commands: tuple[bytes, ...]) -> None:
         for each in commands:
@@ -232,29 +229,31 @@ class VidarSource:
 
     # -- going away and coming back ---------------------------------------------------------------------------------
     def _lose(self) -> None:
-        """The device is gone: let go of it and look out for its return."""
+        """The device is gone, or as good as gone: let go of it and look out for its return."""
         self._dispose()
-        self._gone_ns, self._retry = self._host.now_ns(), 0
+        self._failed = 0
 
     def _return(self, until_ns: int) -> bool:
         """Look for a camera that went away until then; True when it is back and streams.
 
         Raises:
-            DeviceError, HostError: it did not come back within the patience.
+            DeviceError: it did not come back within the patience, or came and did not work.
         """
         while True:
             try:
                 device = usbport.pick(self._backend, self.profile, self._wanted)
                 facts = usbport.open_port(device, self.profile)
             except (DeviceError, HostError) as error:  # also no permission: udev comes after the plug
-                self._give_up(error)
+                self._give_up(error.what)
             else:
                 self._device, self.facts = device, dataclasses.replace(facts, serial=facts.serial or self.facts.serial)
                 try:
                     self._begin()
+                    self._new_epoch(self._trouble)
                     return True
-                except OSError:
+                except OSError as error:
                     self._dispose()
+                    self._give_up(str(error))
             wait = _BACKOFF_NS[min(self._retry, len(_BACKOFF_NS) - 1)]
             self._retry += 1
             now = self._host.now_ns()
@@ -262,13 +261,13 @@ class VidarSource:
             if now + wait >= until_ns:
                 return False
 
-    def _give_up(self, error: RigError) -> None:
-        away = self._host.now_ns() - self._gone_ns
+    def _give_up(self, cause: str) -> None:
+        away = self._host.now_ns() - self._heard_ns
         if away > self._patience:
             raise DeviceError(
                 "the spike camera went away and did not come back",
-                value=f"{self._wanted}, {away / NS:.1f} s", cause=error.what, next="check its cable; spikerig rig find",
-            ) from error  # fmt: skip
+                value=f"{self._wanted}, {away / NS:.1f} s", cause=cause, next="check its cable; spikerig rig find",
+            )  # fmt: skip
 
     def _refused(self, error: OSError) -> RigError:
         return usbport.refusal(error, "the stream does not begin", self.profile.vendor, self.profile.product)

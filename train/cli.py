@@ -48,6 +48,12 @@ def fit(
     eval_every: Annotated[
         float | None, typer.Option(help="Seconds of training between held-out scores; 0 for none. Default: a tenth.")
     ] = None,
+    score_on: Annotated[
+        Path | None, typer.Option(help="Scene whose held-out views make the curve; the scene itself where not given.")
+    ] = None,
+    points_of: Annotated[
+        Path | None, typer.Option(help="Scene whose sparse points to start from; the scene itself where not given.")
+    ] = None,
     checkpoint_every: Annotated[float, typer.Option(help="Seconds between checkpoints.")] = 60.0,
     ply: Annotated[bool, typer.Option("--ply", help="Also write splats.ply for 3DGS viewers.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint.")] = False,
@@ -83,6 +89,7 @@ def fit(
     result = run_fit(
         scene, config, out,
         resume=resume, force=force, eval_every=eval_every, checkpoint_every=checkpoint_every, ply=ply,
+        score_on=score_on, points_of=points_of,
     )  # fmt: skip
     if as_json:
         emit("spikerig.train.fit/1", result)

@@ -23,6 +23,7 @@ from spikerig.train.start import start_splats
 from spikerig.train.targets import load_targets
 
 if TYPE_CHECKING:
+    from spikerig.dataset.scene import Points
     from spikerig.dataset.store import SceneFile
 
 MOST_EXAMS = 8  # held-out views looked at for the curve
@@ -38,6 +39,8 @@ def run_fit(
     eval_every: float | None = None,
     checkpoint_every: float = 60.0,
     ply: bool = False,
+    score_on: Path | None = None,
+    points_of: Path | None = None,
 ) -> dict[str, Any]:
     """Train on a scene file and leave a run folder.
 
@@ -50,6 +53,8 @@ def run_fit(
         eval_every: seconds of training between held-out scores; None = a tenth of the run, 0 = only at the end.
         checkpoint_every: seconds between checkpoints.
         ply: write splats.ply at the end.
+        score_on: scene whose held-out views make the curve; None: those of the scene itself.
+        points_of: scene whose points to start from, in the same world; None: those of the scene itself.
 
     Returns:
         What `train fit --json` prints.
@@ -60,9 +65,11 @@ def run_fit(
     begin = time.monotonic()
     with open_scene(path) as scene, one_torch_thread():
         records.prepare_folder(out, force=force, resume=resume)
-        task, record = prepare(scene, path, config)
-        state = _start(out, scene, task, resume)
-        exams = _exams(scene)
+        points = scene.points if points_of is None else _points(points_of)
+        task, record = prepare(scene, path, config, points)
+        record["points_of"] = None if points_of is None else str(points_of)
+        state = _start(out, scene, task, resume, points, record["points_of"])
+        exams = _exams(scene) if score_on is None else _exams_of(score_on, scene)
     record["prepare_seconds"] = time.monotonic() - begin
     _tell(task, record)
     records.write_json(out / records.RECORD, {**record, "steps": state.step, "train_seconds": state.seconds})
@@ -78,11 +85,20 @@ def run_fit(
     return _finish(state, watch, record, ply)
 
 
-def prepare(scene: SceneFile, path: Path, config: FitConfig) -> tuple[Task, dict[str, Any]]:
-    """All that a fit of an open scene (from `path`) needs, and the record of it for run.json."""
+def _points(path: Path) -> Points | None:
+    from spikerig.dataset.store import open_scene
+
+    with open_scene(path) as other:
+        return other.points
+
+
+def prepare(
+    scene: SceneFile, path: Path, config: FitConfig, points: Points | None = None
+) -> tuple[Task, dict[str, Any]]:
+    """All that a fit of an open scene (from `path`) needs, from its points or others, and the record for run.json."""
     check_pinhole(scene.camera)
     poses = np.stack([scene.view(name, spikes=False).pose.cam_from_world for name in scene.names] or [np.eye(4)[:3]])
-    points = scene.points
+    points = scene.points if points is None else points
     gauge = gauge_of(points.xyz if points is not None and config.init == "points" else np.zeros((0, 3)), poses)
     targets = load_targets(scene, config, gauge)
     found = targets.gray
@@ -99,10 +115,12 @@ def prepare(scene: SceneFile, path: Path, config: FitConfig) -> tuple[Task, dict
     return task, record
 
 
-def _start(out: Path, scene: SceneFile, task: Task, resume: bool) -> State:
+def _start(
+    out: Path, scene: SceneFile, task: Task, resume: bool, points: Points | None, points_of: str | None
+) -> State:
     path = out / records.CHECKPOINT
     if not (resume and path.exists()):
-        return new_state(start_splats(scene.points, task.gauge, task.config), task)
+        return new_state(start_splats(points, task.gauge, task.config), task)
     state, config = load_state(path)
     now = task.config.as_json()
     if config != now:
@@ -111,6 +129,8 @@ def _start(out: Path, scene: SceneFile, task: Task, resume: bool) -> State:
     earlier = records.read_json(out / records.RECORD)
     if earlier["scene"]["sha256"] != records.scene_hash(scene.path):
         raise DataError("this is not the scene the run began with", value=scene.path, next="--force starts anew")
+    if earlier.get("points_of") != points_of:
+        raise UsageError("a run goes on with the points it began with", value=points_of, expected=earlier["points_of"])
     if earlier["machine"]["isa"] != _isa():
         note(f"warning: begun with {earlier['machine']['isa']} kernels, going on with {_isa()}: other bits")
     note(f"going on at step {state.step}")
@@ -126,6 +146,16 @@ def _isa() -> str:
 def _exams(scene: SceneFile) -> list[Exam]:
     exams, _ = novel_views(scene)
     return exams[:: max(1, -(-len(exams) // MOST_EXAMS))]
+
+
+def _exams_of(path: Path, trained: SceneFile) -> list[Exam]:
+    from spikerig.dataset.store import open_scene
+
+    with open_scene(path) as other:
+        sizes = [f"{s.camera.width}x{s.camera.height}" for s in (other, trained)]
+        if sizes[0] != sizes[1]:
+            raise DataError("the scene to score on has another size", value=sizes[0], expected=sizes[1])
+        return _exams(other)
 
 
 def _tell(task: Task, record: dict[str, Any]) -> None:

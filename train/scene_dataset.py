@@ -11,13 +11,14 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
+from spikerig.calib.straight import Straight, straight_of
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.images import linear_from_srgb, srgb_from_linear
 from spikerig.dataset.scene import View
 from spikerig.dataset.spikes import SpikeStream
 from spikerig.dataset.store import SceneFile, open_scene
 from spikerig.dataset.texture import Texture, tfi, tfp, tfp_adaptive
-from spikerig.train.trajectory import instant_ns, phases, sub_pose
+from spikerig.train.trajectory import phases, sub_pose
 
 TEXTURES: dict[str, Callable[[SpikeStream, float, int], Texture]] = {
     "tfp": tfp,
@@ -71,6 +72,7 @@ class SceneDataset(Dataset[dict[str, Any]]):
         self._file: SceneFile | None = None
         self._owner = 0
         with open_scene(self.path) as scene:
+            self.straight = straight_of(scene) if self.textures else Straight()
             self.names = {"train": scene.train, "test": scene.test, "all": scene.names}[split]
 
     def __len__(self) -> int:
@@ -92,14 +94,14 @@ class SceneDataset(Dataset[dict[str, Any]]):
             codes = linear_from_srgb(codes)
         elif (view.frame.transfer, self.encoding) == ("linear", "srgb"):
             codes = srgb_from_linear(codes)
-        at_ns = [instant_ns(view.frame, phase) for phase in self.phases]
+        at_ns = [view.instant_ns(phase) for phase in self.phases]
         item: dict[str, Any] = {
             "name": view.name,
             "image": torch.from_numpy(np.asarray(codes, np.float32)),
             "valid": torch.from_numpy(np.array(view.valid)),
             "K": torch.tensor(scene.camera.K, dtype=torch.float32),
             "cam_from_world": torch.tensor(view.pose.cam_from_world, dtype=torch.float32),
-            "at_ns": torch.tensor([round(t) for t in at_ns]),
+            "at_ns": torch.tensor(at_ns),
         }
         if view.trajectory is not None or len(self.phases) == 1:
             poses = np.stack([sub_pose(view, phase) for phase in self.phases])
@@ -109,7 +111,7 @@ class SceneDataset(Dataset[dict[str, Any]]):
             item[name], item[f"{name}_known"] = torch.from_numpy(light), torch.from_numpy(known)
         return item
 
-    def _texture(self, view: View, name: str, at_ns: list[float]) -> tuple[np.ndarray, np.ndarray]:
+    def _texture(self, view: View, name: str, at_ns: list[int]) -> tuple[np.ndarray, np.ndarray]:
         if view.spikes is None:
             shape = (len(at_ns), *view.valid.shape)
             return np.zeros(shape, np.float32), np.zeros(shape, bool)
@@ -119,6 +121,6 @@ class SceneDataset(Dataset[dict[str, Any]]):
                 value=f"{self.path}: {view.name}, {view.frame.row_ns} ns a row",
                 next="align the take first",
             )
-        ticks = [view.spikes.tick_at(round(t)) for t in at_ns]
-        made = [TEXTURES[name](view.spikes, tick, self.window) for tick in ticks]
+        ticks = [view.spikes.tick_at(t) for t in at_ns]
+        made = [self.straight.texture(TEXTURES[name](view.spikes, tick, self.window)) for tick in ticks]
         return np.stack([t.light for t in made]), np.stack([t.known for t in made])

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from spikerig.calib.straight import Straight, straight_of
 from spikerig.dataset.bayer import bayer_of
 from spikerig.dataset.clocktime import ClockModel
 from spikerig.dataset.errors import DataError, UsageError
@@ -20,7 +21,7 @@ from spikerig.train.config import FitConfig
 from spikerig.train.gauge import Gauge
 from spikerig.train.gray import Gray, Pairs, solve
 from spikerig.train.losses import mean_weights, ratio_target, srgb_from_linear
-from spikerig.train.trajectory import instant_ns, phases, pose_at, sub_pose
+from spikerig.train.trajectory import phases, pose_at, sub_pose
 
 if TYPE_CHECKING:
     from spikerig.dataset.store import SceneFile
@@ -140,12 +141,12 @@ def average_texture(found: list[Texture]) -> tuple[NDArray[np.float32], NDArray[
     return (light / np.maximum(known.sum(0), 1)).astype(np.float32), np.asarray(known.any(0), np.bool_)
 
 
-def exposure_mean(view: View, clock: ClockModel | None) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Spikes a tick over the whole exposure: (light [H,W], known)."""
-    from spikerig.dataset.texture import window_sum
+def exposure_mean(view: View, clock: ClockModel | None) -> Texture:
+    """Spikes a tick over the whole exposure, of the raw spikes."""
+    from spikerig.dataset.texture import Texture, window_sum
 
     stream = spikes_of(view)
-    t0, t1 = (round(spike_tick(view, instant_ns(view.frame, phase), clock)) for phase in (0.0, 1.0))
+    t0, t1 = (round(spike_tick(view, view.instant_ns(phase), clock)) for phase in (0.0, 1.0))
     if not (0 <= t0 < t1 <= stream.ticks):
         raise DataError(
             f"the spikes of view '{view.name}' do not cover its exposure",
@@ -154,8 +155,8 @@ def exposure_mean(view: View, clock: ClockModel | None) -> tuple[NDArray[np.floa
             next="spikerig data verify FILE",
         )
     lost = any(a < t1 and b > t0 for a, b in stream.lost)
-    light = np.asarray(window_sum(stream, t0, t1), np.float32) / (t1 - t0)
-    return np.asarray(light, np.float32), np.full(light.shape, not lost)
+    light = np.asarray(window_sum(stream, t0, t1), np.float32) / np.float32(t1 - t0)
+    return Texture(light, np.full(light.shape, not lost), (t0 + t1) / 2, "exposure")
 
 
 def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
@@ -169,6 +170,7 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
     Raises:
         DataError: no training views, no spikes, no trajectory or no truth where the method needs it; a colour spike
             camera.
+        UsageError: single spikes are asked for, and the spike arm's lens bends.
     Cost: a texture takes milliseconds; memory 12 bytes a pixel and view, +4 a texture, +6 a ratio instant.
     """
     if not scene.train:
@@ -181,6 +183,14 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
             value=scene.name,
             expected="a scene of a gray spike camera, or a method without spikes",
         )
+    straight = straight_of(scene) if config.needs_spikes else Straight()
+    if config.textures == "raw" and straight.resamples:
+        raise UsageError(
+            "single spikes cannot be brought to the scene's camera: its spike lens bends, and they would be blended",
+            value="textures=raw",
+            expected="a texture: tfp, tfi, both or tfi-window",
+            next="--set textures=tfp --set texture_window=8",
+        )
     colour = phases(config.poses_per_view, config.instants_rule, config.pose_label)
     tfs = phases(config.textures_per_view, config.instants_rule, config.pose_label) if config.tfs_weight > 0 else ()
     ratio = phases(config.ratio_instants, "midpoints", config.pose_label) if config.ratio_until > 0 else ()
@@ -188,7 +198,7 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
         colour, tfs = ratio, (ratio if tfs else ())
     pairs, raw, bar = Pairs(), [], Progress("preparing views", len(scene.train), "views")
     for name in scene.train:
-        raw.append(_read(scene, name, config, (colour, tfs, ratio), pairs))
+        raw.append(_read(scene, name, config, (colour, tfs, ratio), pairs, straight))
         bar.step()
     gray = solve(pairs, config.gray, scene.light_gain) if config.needs_spikes else None
     views = tuple(_finish(each, config, gauge, gray, (colour, tfs, ratio)) for each in raw)
@@ -206,7 +216,12 @@ def _remarks(raw: list[dict[str, Any]]) -> tuple[str, ...]:
 
 
 def _read(
-    scene: SceneFile, name: str, config: FitConfig, instants: tuple[tuple[float, ...], ...], pairs: Pairs
+    scene: SceneFile,
+    name: str,
+    config: FitConfig,
+    instants: tuple[tuple[float, ...], ...],
+    pairs: Pairs,
+    straight: Straight,
 ) -> dict[str, Any]:
     from spikerig.dataset.images import linear_from_srgb
 
@@ -229,12 +244,13 @@ def _read(
         made["pose"] = dict.fromkeys(made["pose"], truth_pose(scene, view))
     if config.needs_spikes:
         clock = scene.clock
-        mean, known = exposure_mean(view, clock)
-        pairs.add(view.frame.pixels8, light, mean, known & view.valid)
-        made["mean"], made["mean_known"] = mean, known
+        mean = straight.texture(exposure_mean(view, clock))
+        pairs.add(view.frame.pixels8, light, mean.light, mean.known & view.valid)
+        made["mean"], made["mean_known"] = mean.light, mean.known
         for phase in dict.fromkeys((*tfs, *ratio)):
-            tick = spike_tick(view, instant_ns(view.frame, phase), clock)
-            made["textures"][phase] = textures_at(view.spikes, tick, config.textures, config.texture_window)
+            tick = spike_tick(view, view.instant_ns(phase), clock)
+            found = textures_at(view.spikes, tick, config.textures, config.texture_window)
+            made["textures"][phase] = [straight.texture(t) for t in found]
     return made
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.errors import DataError, UsageError
-from spikerig.dataset.scene import Floats, Frame, Trajectory, View
+from spikerig.dataset.scene import Floats, Trajectory, View
 
 SMALL = 1e-2  # below this angle the Taylor branches below are exact to float64 (next terms ~ angle^6/5000 = 2e-16)
 
@@ -137,12 +137,6 @@ def phases(n: int, rule: str, label: str) -> tuple[float, ...]:
     return tuple((j + 0.5) / n if rule == "midpoints" else j / (n - 1) for j in range(n))
 
 
-def instant_ns(frame: Frame, phase: float) -> float:
-    """Nanoseconds at a fraction of the exposure of the frame's middle row (exact for a global shutter)."""
-    middle = frame.row_ns * (frame.pixels.shape[0] // 2)
-    return float(frame.start_ns + middle) + phase * frame.exposure_ns
-
-
 def sub_pose(view: View, phase: float) -> Floats:
     """The camera [3,4] at a fraction of a view's exposure.
 
@@ -150,7 +144,7 @@ def sub_pose(view: View, phase: float) -> Floats:
         DataError: the view has no trajectory and the instant is not mid-exposure.
     """
     if view.trajectory is not None and len(view.trajectory.at_ns) > 1:
-        return pose_at(view.trajectory, instant_ns(view.frame, phase))
+        return pose_at(view.trajectory, view.instant_ns(phase))
     if phase == 0.5:
         return view.pose.cam_from_world
     raise DataError(

@@ -12,6 +12,7 @@ from spikerig.rigctl.sim.rgb import window_weights
 
 NEAR = 0.8  # light that optics may raise beyond one threshold a tick
 ARMS = ("spike", "rgb", "both")
+PLACING = ("misalignment", "mirror_flip", "distortion")  # effects that say where a pixel looks
 
 
 def on_arm(arm: str, change: Callable[[Floats], Floats]) -> Hooks:

@@ -41,7 +41,7 @@ def take_view(spec: SceneSpec, number: int, stage: Stage | None = None) -> Taken
     track = Track(phases, path.poses(phases))
     held_out = spec.orbit.held_out()
     if number in held_out:
-        return take_sharp(rig, number, name, times, sharp, track)
+        return take_sharp(rig, number, name, times, sharp, track, _first(rgb_arm(spec, stage, label[None])))
     poses = path.poses(times.phases)
     rgb = np.empty((len(poses), *sharp.shape), np.float32)
     for k, pose in enumerate(poses):
@@ -51,6 +51,10 @@ def take_view(spec: SceneSpec, number: int, stage: Stage | None = None) -> Taken
     share = share_of(spec.cloud.count, train.index(number), len(train))
     depth = stage.depth(rig.camera, label)
     return replace(taken, points=surface(rig, number, spec.cloud, share, taken.view, depth))
+
+
+def _first(pictures: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
+    return None if pictures is None else pictures[0]
 
 
 def rgb_arm(spec: SceneSpec, stage: Stage, poses: NDArray[np.float64]) -> NDArray[np.float32] | None:

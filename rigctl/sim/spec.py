@@ -364,8 +364,12 @@ def _check_views(spec: SceneSpec, faults: Faults) -> None:
             return
 
 
-def with_changes(spec: SceneSpec, *, seed: int | None = None, views: int | None = None) -> SceneSpec:
-    """The scene with another seed (shake, noise, points; not the world) or number of viewpoints on the same arc."""
+def with_changes(spec: SceneSpec, *, seed: int | None = None, views: int | None = None, rig: str = "") -> SceneSpec:
+    """The scene with another seed (shake, noise, points; not the world), number of views on the same arc, rig."""
+    if rig:
+        from spikerig.rigctl.sim.pairs import rig_effects
+
+        spec = dataclasses.replace(spec, effects=rig_effects(rig, spec.effects))
     if seed is not None:
         if not 0 <= seed < 2**32:
             raise UsageError("a seed is a whole number", value=seed, expected="0 to 4294967295")

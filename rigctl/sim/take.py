@@ -20,10 +20,11 @@ from spikerig.dataset.clocktime import ClockModel
 from spikerig.dataset.errors import HostError, UsageError
 from spikerig.dataset.kernels import count
 from spikerig.dataset.scene import Camera, Frame, Points, Pose, Trajectory, Truth, View
+from spikerig.rigctl.sim.arms import PLACING
 from spikerig.rigctl.sim.draws import stream
-from spikerig.rigctl.sim.effects import Effect, Site, parameters
+from spikerig.rigctl.sim.effects import Effect, Site, in_order, parameters
 from spikerig.rigctl.sim.effects import Stage as EffectStage
-from spikerig.rigctl.sim.rgb import encode
+from spikerig.rigctl.sim.rgb import encode, optics
 from spikerig.rigctl.sim.schedule import Schedule, Track, phase_ns, start_ns
 from spikerig.rigctl.sim.sensor import Light
 from spikerig.rigctl.sim.simulate import simulate
@@ -84,19 +85,36 @@ class Taken:
 NO_POINTS = Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), "simulator")
 
 
-def take_sharp(rig: Rig, number: int, name: str, plan: Schedule, sharp: NDArray[np.float32], track: Track) -> Taken:
-    """A view for testing: the sharp picture at the label, no spikes.
+def take_sharp(
+    rig: Rig,
+    number: int,
+    name: str,
+    plan: Schedule,
+    sharp: NDArray[np.float32],
+    track: Track,
+    arm: NDArray[np.float32] | None = None,
+) -> Taken:
+    """A view for testing: the sharp picture at the label as the RGB arm is placed to see it, no spikes.
 
     Args:
         rig: the sensors.
         number, name: of the view.
         plan: its schedule.
-        sharp: linear light float32[H,W,3] at the label.
+        sharp: linear light float32[H,W,3] at the label, of the spike arm's camera: the truth.
         track: where the camera was.
+        arm: the same as the RGB arm sees it, where that differs.
+
+    Edges:
+        Of the effects only those that place the picture count (`PLACING`): a held-out picture has no other faults.
     """
     view, at_ns, path = _labelled(rig, number, name, plan, track, "test")
-    frame = Frame(encode(sharp), start_ns=at_ns)
-    return Taken(replace(view, frame=frame), sharp, at_ns, path, NO_POINTS, np.nan, 0.0, 0)
+    height, width = sharp.shape[:2]
+    site = Site(height, width, number, rig.seed, rig.exposure.rate_hz, camera=rig.camera, own_arm=arm is not None)
+    placing = [effect.begin(site).rgb_optics for effect in in_order(rig.effects) if effect.name in PLACING]
+    seen = optics((sharp if arm is None else arm)[None], placing)[0]
+    return Taken(
+        replace(view, frame=Frame(encode(seen), start_ns=at_ns)), sharp, at_ns, path, NO_POINTS, np.nan, 0.0, 0
+    )
 
 
 def take_blurry(

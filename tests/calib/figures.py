@@ -7,10 +7,11 @@ import numpy as np
 from calib_rigs import BOARD, crop_error_px, rig, seen_of, step_of
 
 from spikerig.calib.align import pair, warp_of
-from spikerig.calib.boards import _find_plain, find, gray8
+from spikerig.calib.boards import Board, _find_plain, find, gray8
 from spikerig.calib.measure import measure, report
 from spikerig.calib.optics import sight_of
 from spikerig.calib.parity import times
+from spikerig.calib.rig import RigCalibration
 from spikerig.dataset.images import linear_from_srgb, srgb8_from_linear
 from spikerig.dataset.scene import Frame, Pose, View
 from spikerig.dataset.texture import Texture, tfp
@@ -62,9 +63,32 @@ def main() -> None:
         print(f"| {name} | {corner:.4f} | {bare:.4f} | {rms['spike']:.4f} | {rms['rgb']:.4f} | {rms['stereo']:.4f} | "
               f"{crop_error_px(c, true):.3f} | {c.sd['crop_px']:.3f} | {abs(r['fx_px'] - 620):.3f} | "
               f"{told.fit.sure.sd['spike.fx_px']:.3f} |")  # fmt: skip
+    charuco(true, poses)
     print(f"\nCPU seconds: board in a texture {find_s:.2f}, in a {WIDTH} px wide picture {rgb_s:.2f}, fit and verdict "
           f"of {VIEWS} views {fit_s:.1f}")  # fmt: skip
     align(true, light[1], gray[1])
+
+
+def charuco(true: RigCalibration, poses: np.ndarray) -> None:
+    """A ChArUco board of 6x4 corners, 23 mm, through the same noise: whole views and parts of it."""
+    board, art, size = Board(6, 4, 23.0, "DICT_4X4_50", 17.25), bp.charuco(6, 4), {"cols": 6, "rows": 4, "square": 23.0}
+    spike, rgb = bp.lens("spike", 5), bp.lens("rgb", 3, rgb_width=WIDTH)
+    light = [0.45 * spike.picture(p, art=art, **size) for p in poses]
+    gray = [linear_from_srgb(srgb8_from_linear(rgb.picture(times(step_of(true), p), art=art, **size))) for p in poses]
+    seen_rgb = sight_of([find(g, board) for g in gray], board, WIDTH, WIDTH * 9 // 16)
+    for name, pictures in (
+        ("clean light", light),
+        ("spikes, noisy", [texture(p, k, 256) for k, p in enumerate(light)]),
+    ):
+        found = [find(p, board) for p in pictures]
+        off = [off_px(f.px[f.seen], spike.corners(p, **size)[f.seen]) for f, p in zip(found, poses, strict=True) if f]
+        r = measure(board, seen_of((sight_of(found, board, 400, 250), seen_rgb)), (False, False))
+        told = report(r)
+        assert r.fit is not None
+        print(f"ChArUco, {name}: {sum(int(f.seen.sum()) for f in found if f)} of {24 * VIEWS} corners, off "
+              f"{np.sqrt(np.mean(np.square(off))):.4f} px, residual {told['rms_px']['spike']:.4f}, rgb "
+              f"{told['rms_px']['rgb']:.4f}, together {told['rms_px']['stereo']:.4f}; crop off "
+              f"{crop_error_px(r.fit.calibration, true):.3f}, told sd {told['crop']['sd_worst_px']:.3f}")  # fmt: skip
 
 
 def texture(light: np.ndarray, seed: int, ticks: int, noisy: bool = True) -> np.ndarray:
@@ -72,7 +96,7 @@ def texture(light: np.ndarray, seed: int, ticks: int, noisy: bool = True) -> np.
     return tfp(bp.spikes(light, ticks, seed, noisy=noisy), ticks // 2, ticks).light
 
 
-def align(true: object, light: np.ndarray, gray: np.ndarray) -> None:
+def align(true: RigCalibration, light: np.ndarray, gray: np.ndarray) -> None:
     """How long a warp and a view take."""
     pixels = srgb8_from_linear(np.repeat(gray[..., None], 3, 2))
     shape = pixels.shape[:2]

@@ -4,40 +4,29 @@ import dataclasses
 import json
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from calib_takes import SCENE, misaligned, rig_of
 from hard_sim import small
 
 from spikerig.calib.bundle import turn
-from spikerig.calib.parity import inverse
-from spikerig.calib.rig import RigCalibration, write_calibration
+from spikerig.calib.rig import write_calibration
 from spikerig.dataset import cli
+from spikerig.dataset.flat import FlatField, write_flat
 from spikerig.dataset.scene import Pose
 from spikerig.dataset.store import open_scene, verify_scene
 from spikerig.rigctl.sim.capture import capture
-from spikerig.rigctl.sim.effects.misalignment import Misalignment
-
-SCENE: dict[str, Any] = {"camera__width": 160, "camera__height": 100, "exposure__exposure_ms": 2.0}
-OFF = Misalignment(rotation_deg=(0.8, -1.0, 1.5))
 
 
 @pytest.fixture(scope="module")
 def takes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """raw.h5, whose RGB arm is turned; good.h5, whose arms agree; calib.json, the true rig."""
     folder = tmp_path_factory.mktemp("takes")
-    turned = {"name": "misalignment", "rotation_deg": list(OFF.rotation_deg)}
-    capture(small(**SCENE, effects=[turned, "threshold_fpn"]), folder / "raw.h5", workers=1)
+    misaligned(folder / "raw.h5")
     capture(small(**SCENE, effects=["threshold_fpn"]), folder / "good.h5", workers=1)
     write_calibration(folder / "calib.json", rig_of(folder / "raw.h5"))
     return folder
-
-
-def rig_of(path: Path) -> RigCalibration:
-    with open_scene(path) as scene:
-        step = OFF.rgb_from_spike
-        return RigCalibration(scene.camera, scene.camera, Pose(inverse(step)), "common", None, (1000.0, 5000.0))
 
 
 def run(capsys: pytest.CaptureFixture[str], *words: str | Path) -> tuple[int, dict]:
@@ -101,7 +90,7 @@ def test_in_place_only_when_whole(takes: Path, tmp_path: Path, capsys: pytest.Ca
         real(source, target)
 
     with monkeypatch.context() as broken:
-        broken.setattr(aligned_scene.os, "replace", stopped)
+        broken.setattr(os, "replace", stopped)
         assert cli.run(["calib", "align", str(path), "--with", str(takes / "calib.json")]) == 130
     capsys.readouterr()
     assert path.read_bytes() == before
@@ -152,3 +141,29 @@ def test_what_cannot_be_aligned(takes: Path, tmp_path: Path, capsys: pytest.Capt
     assert code == 0
     assert told["written"] is None
     assert told["valid"] < 0.92
+
+
+def test_textures_are_evened_out_on_request(takes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(3)
+    ones = np.ones((100, 160), np.float32)
+    rough = np.where(rng.random(ones.shape) < 0.5, 0.4, 1.6).astype(np.float32)
+    for name, gain in (("even", ones), ("rough", rough)):
+        write_flat(tmp_path / f"{name}.npz", FlatField(gain, 0 * ones, ones > 0, ones))
+    words = (takes / "raw.h5", "--with", takes / "calib.json")
+    score = {}
+    for name in ("even", "rough"):
+        code, told = run(capsys, *words, "--check", "--flat", tmp_path / f"{name}.npz", "--force")
+        assert code == 0
+        score[name] = told["edges_px"]["median"]
+    assert score["even"] == run(capsys, *words, "--check")[1]["edges_px"]["median"]
+    assert score["rough"] is None or score["rough"] > score["even"]  # a wrong map spoils the edges: it was used
+    code, told = run(capsys, *words, "-o", tmp_path / "out.h5", "--flat", tmp_path / "even.npz")
+    assert code == 0
+    with open_scene(tmp_path / "out.h5") as scene:
+        assert scene.info["align"]["files"]["flat"]["name"] == "even.npz"
+        assert len(scene.info["align"]["files"]["flat"]["sha256"]) == 64
+    small = FlatField(*(a[:50] for a in (ones, ones, ones > 0, ones)))
+    write_flat(tmp_path / "small.npz", small)
+    code, told = run(capsys, *words, "--check", "--flat", tmp_path / "small.npz")
+    assert code == 2
+    assert "another sensor" in told["error"]["what"]

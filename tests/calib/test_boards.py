@@ -102,6 +102,20 @@ def test_another_board_is_not_found_but_named(light: np.ndarray) -> None:
     assert gray8(blank).max() == 0
 
 
+@pytest.mark.parametrize("old", [False, True])
+def test_charuco_boards_of_both_patterns_are_found(old: bool) -> None:
+    board = board_of("6x5", 24, "DICT_4X4_50")
+    made = cv2.aruco.CharucoBoard((7, 6), 24, 18, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
+    made.setLegacyPattern(old)
+    flat = np.full((420, 480), 255, np.uint8)
+    flat[30:390, 30:450] = made.generateImage((420, 360))
+    found = find(linear_from_srgb(flat), board)
+    assert found is not None
+    assert found.seen.all()
+    true = np.stack(np.meshgrid(np.arange(1, 7), np.arange(1, 6)), -1).reshape(-1, 2) * 60.0 + 30
+    assert off_px(found.px, true) < 0.05
+
+
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_charuco_boards_say_whether_they_are_seen_in_a_mirror(mirrored: bool) -> None:
     board = board_of("9x6", 24, "DICT_5X5_100", 18)

@@ -31,6 +31,11 @@ GOOD = np.ones((H, W), bool)
 GOOD[[5, 20, 40], [7, 30, 50]] = False
 
 
+RGB_Y, RGB_X = np.mgrid[0:40, 0:64]
+RGB_R2 = (((RGB_X + 0.5) - 32) ** 2 + ((RGB_Y + 0.5) - 20) ** 2) / (32**2 + 20**2)
+RGB_FALL = (1 - 0.15 * RGB_R2).astype(np.float32)
+
+
 def recorded(light: float, ticks: int, seed: int, electrons: float = 560) -> SpikeStream:
     rng = np.random.default_rng(seed)
     charge = (GAIN * light + DARK).astype(np.float32)[None].repeat(ticks, 0)
@@ -50,7 +55,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for k, rgb in enumerate(colours):
         light = 0.5 * float(np.dot((0.25, 0.6, 0.15), rgb))
         write_spikes(folder / f"spike/l{k}.npz", recorded(light, 4000, k))
-        pixels = srgb8_from_linear(np.broadcast_to(np.float32(rgb), (40, 64, 3)))
+        pixels = srgb8_from_linear(RGB_FALL[..., None] * np.float32(rgb))
         write_image(folder / f"rgb/l{k}.png", np.ascontiguousarray(pixels))
     write_spikes(folder / "dark.npz", recorded(0.0, 12_000, 9))
     return folder
@@ -206,6 +211,8 @@ def test_the_command(files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert told["response"] == pytest.approx([0.25, 0.6, 0.15], abs=0.02)
     assert told["split_ratio"] == pytest.approx(0.5 * GAIN[GOOD].mean(), rel=0.02)
     assert told["curve"] == pytest.approx(1, abs=0.03)
+    assert told["falloff"] == pytest.approx(0.2 * R2[0, 0], rel=0.15)
+    assert told["falloff_rgb"] == pytest.approx(0.15, rel=0.1)
     record = read_calibration(into)
     assert record.id == told["id"]
     assert record.split_ratio == pytest.approx(told["split_ratio"], abs=1e-8)

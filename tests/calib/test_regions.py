@@ -10,14 +10,16 @@ import pytest
 from hard_sim import small
 
 from spikerig.calib.align import Region, warp_of, within_polygon
-from spikerig.calib.regions import blinking, blinking_regions, check_regions, panel_of, read_regions, regions_json
+from spikerig.calib.regions import blinking_regions, check_regions, dwell_ticks, panel_of, read_regions, regions_json
 from spikerig.calib.rig import RigCalibration, write_calibration
 from spikerig.dataset import cli
 from spikerig.dataset.errors import DataError, UsageError
+from spikerig.dataset.panel import Panel
 from spikerig.dataset.scene import Pose
 from spikerig.dataset.spikes import SpikeStream
 from spikerig.dataset.store import SceneWriter, open_scene
 from spikerig.rigctl.sim.capture import capture
+from spikerig.rigctl.sim.emulate.panel_light import PanelInView, with_panel
 
 H, W, TICKS = 60, 96, 960
 LAMPS = {(20, 30): 32, (20, 38): 48, (20, 46): 64, (26, 30): 96, (26, 38): 4, (26, 46): 0}  # at y, x: half a period
@@ -58,7 +60,7 @@ def test_lamps_are_found_and_scenes_are_not(speed: float, shake: bool) -> None:
     assert blinking_regions(stream_of(base)) == ()
     lit = base.copy()
     lit[:, 17:32, 27:52] = 0.03 + panel()[:, 17:32, 27:52]  # a dark box with lamps
-    found = blinking(stream_of(lit))
+    found = dwell_ticks(stream_of(lit)) > 0
     slow = [(y, x) for (y, x), half in LAMPS.items() if half >= 32]
     assert all(found[y : y + 3, x : x + 3].all() for y, x in slow)
     outside = found.copy()
@@ -71,20 +73,45 @@ def test_lamps_are_found_and_scenes_are_not(speed: float, shake: bool) -> None:
     np.testing.assert_allclose([*low, *high], [27, 17, 52, 32], atol=0.01)  # the hull of the slow lamps, and 3 px
 
 
+@pytest.mark.parametrize("rate_hz", [20_000.0, 40_000.0])
+def test_the_lamps_that_blink_say_where_the_whole_panel_is(rate_hz: float) -> None:
+    """The box's own panel, 26 bits in two rows, seen askew for 17 ms: most of its lamps do not blink meanwhile."""
+    usual = Panel()
+    mm = np.array([[led.x_mm, led.y_mm] for led in usual.leds])
+    at = [150, 40] + mm @ np.array([[-0.9, 0.15], [-0.1, -0.2]])
+    view = PanelInView(usual, at, 1.3, 0.9, 120, 180)
+    ticks = round(0.0175 * rate_hz)
+    still = np.full((120, 180), 0.1)
+    bits = SpikeStream.from_pixels(np.random.default_rng(0).random((ticks, 120, 180)) < 0.1).bits
+    made, _ = with_panel(bits, still, view, 123_456_789 + np.arange(ticks + 1) * round(1e9 / rate_hz))
+    (region,) = blinking_regions(SpikeStream(made, 180, rate_hz))
+    assert within_polygon(at, region.polygon_px).all()
+    lit = np.stack([view.columns, view.rows], -1).astype(np.float64) + 0.5
+    assert within_polygon(lit, region.polygon_px).all()
+    assert np.linalg.norm(region.polygon_px.mean(0) - at.mean(0)) < 1.5
+    x, y = region.polygon_px.T
+    area = 0.5 * abs(x @ np.roll(y, 1) - y @ np.roll(x, 1))
+    assert area < 2 * abs(np.linalg.det([at[26] - at[0], at[25] - at[0]])) + 2000  # and little else
+
+
 def test_what_is_no_panel() -> None:
     t = np.arange(TICKS)
     room = 0.1 + 0.7 * ((t // 48) % 2)[:, None, None] * np.ones((1, H, W))
-    assert blinking(stream_of(room)).mean() > 0.9
+    assert (dwell_ticks(stream_of(room)) > 0).mean() > 0.9
     assert blinking_regions(stream_of(room)) == ()  # the light itself
+    strange = np.full((TICKS, H, W), 0.05)  # lamps with a panel's paces, which do not stand like one
+    for (y, x), half in {(10, 10): 32, (50, 80): 32, (50, 10): 64, (10, 80): 64}.items():
+        strange[:, y : y + 3, x : x + 3] = (0.8 * ((t // half) % 2))[:, None, None]
+    assert len(blinking_regions(stream_of(strange))) == 4
     specks = np.full((TICKS, H, W), 0.2)
     specks[:, 10, 10] = specks[:, 40, 70] = 0.8 * ((t // 48) % 2)
     assert blinking_regions(stream_of(specks)) == ()
-    assert not blinking(SpikeStream.from_pixels(np.ones((40, H, W), bool), 40_000.0)).any()
+    assert not (dwell_ticks(SpikeStream.from_pixels(np.ones((40, H, W), bool), 40_000.0)) > 0).any()
     noise = np.random.default_rng(0).random((TICKS, H, W)) < 0.4  # 50 times the noise of integrate and fire
-    assert not blinking(SpikeStream.from_pixels(noise, 40_000.0)).any()
+    assert not (dwell_ticks(SpikeStream.from_pixels(noise, 40_000.0)) > 0).any()
     lit = stream_of(0.05 + panel())
     lost = replace(lit, bits=np.where((t // 100 == 3)[:, None, None], 0, lit.bits), lost=np.array([[300, 400]]))
-    assert blinking(lost).sum() <= blinking(lit).sum() == 36
+    assert (dwell_ticks(lost) > 0).sum() <= (dwell_ticks(lit) > 0).sum() == 36
 
 
 def test_rectangles_and_files(tmp_path: Path) -> None:

@@ -103,7 +103,7 @@ def test_views_that_lie_are_refused_by_line(folder: Path, line: str) -> None:
         file.write(line)
     with pytest.raises(DataError, match="line"):
         open_take(folder).views()
-    assert [f.importance for f in verify_take(folder)[0] if f.check == "views"] == ["critical"]
+    assert [f.importance for f in verify_take(folder)[0] if f.check == "views"] == ["error"]
 
 
 @pytest.mark.parametrize(
@@ -138,16 +138,16 @@ def checks(folder: Path) -> list[tuple[str, str]]:
 
 def test_a_good_take_has_only_its_told_loss(folder: Path) -> None:
     found, figures = verify_take(folder)
-    assert [(f.check, f.importance) for f in found] == [("loss", "violation")]
+    assert [(f.check, f.importance) for f in found] == [("loss", "warning")]
     assert figures == {"status": "complete", "chunks": 4, "bytes": 4 * SIZE, "epochs": 2, "lost_transport": 77,
                        "lost_recorder": 0, "views_kept": 2}  # fmt: skip
 
 
 def test_bytes_missing_unsaid_chunks_missing_and_damage_are_critical(folder: Path) -> None:
     (folder / "spikes" / "0001.seg").write_bytes(chunk(3, 0, 9 * SIZE) + chunk(5, 0, 10 * SIZE) + b"rubbish")
-    assert checks(folder) == [("gap", "critical"), ("order", "critical"), ("chunk", "critical")]
+    assert checks(folder) == [("gap", "error"), ("order", "error"), ("chunk", "error")]
     (folder / "spikes" / "0000.seg").unlink()
-    assert checks(folder)[0] == ("order", "critical")
+    assert checks(folder)[0] == ("order", "error")
 
 
 def test_the_command(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -58,7 +58,7 @@ def test_a_scene_is_whole(tmp_path: Path) -> None:
         assert view.spikes.t0_ns == begin - 16 * 25_000
         assert view.frame.start_ns == begin
         assert view.frame.exposure_ns == 1_000_000
-        assert view.frame.mid_ns == begin + 500_000
+        assert view.mid_ns == begin + 500_000
         assert view.trajectory is not None
         assert np.array_equal(view.trajectory.poses, path.poses((view.trajectory.at_ns - begin) / 1e6))
     assert verify_scene(tmp_path / "s.h5") == []

@@ -16,7 +16,6 @@ from spikerig.train.config import configure
 from spikerig.train.gauge import Gauge
 from spikerig.train.metrics import psnr
 from spikerig.train.targets import Targets, average_texture, load_targets, spike_tick, windowed_tfi
-from spikerig.train.trajectory import instant_ns
 
 UNIT = Gauge((0.0, 0.0, 0.0), 1.0)
 
@@ -108,7 +107,7 @@ def test_unknown_and_invalid_pixels_carry_no_weight(tiny, tmp_path):
 def test_spikes_on_another_clock_are_mapped_or_refused(tiny, tmp_path):
     with open_scene(tiny) as scene:
         view = scene.view(scene.train[0])
-        middle = instant_ns(view.frame, 0.5)
+        middle = view.instant_ns(0.5)
         expected = spike_tick(view, middle, None)
     foreign = replace(view, spikes=replace(view.spikes, clock="vidar", t0_ns=view.spikes.t0_ns + 777_000))
     clock = ClockModel(np.array([777_000]), np.array([0]), np.zeros(1))

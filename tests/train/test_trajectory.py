@@ -9,7 +9,6 @@ from spikerig.train.trajectory import (
     between,
     compose,
     exp_se3,
-    instant_ns,
     inverse,
     log_se3,
     phases,
@@ -85,8 +84,6 @@ def test_instants_of_an_exposure():
     assert phases(3, "endpoints", "mid") == (0, 0.5, 1)
     with pytest.raises(UsageError):
         phases(0, "midpoints", "mid")
-    rolling = Frame(np.zeros((11, 4, 3), np.uint8), start_ns=1000, exposure_ns=80, row_ns=10)
-    assert instant_ns(rolling, 0.5) == rolling.mid_ns
 
 
 def test_without_a_trajectory_only_mid_exposure_is_known():

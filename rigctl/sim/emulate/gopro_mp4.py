@@ -1,4 +1,4 @@
-"""The clip an emulated GoPro writes: H.264 pictures of a scene, and the telemetry that tells their true times."""
+"""The clip an emulated GoPro writes: H.264 or H.265 pictures of a scene, and telemetry that tells their true times."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.clocktime import NS
-from spikerig.dataset.errors import HostError
+from spikerig.dataset.errors import HostError, UsageError
 from spikerig.dataset.mp4_boxes import read_movie
 from spikerig.rigctl.sim.draws import stream
 from spikerig.rigctl.sim.emulate.gpmf_write import box, item, nest, telemetry_track
@@ -42,19 +42,21 @@ class Recording:
         header: keys of the settings in `moov/udta/GPMF`, over those of a HERO9.
         spare: frame stamps beyond the last frame; a real clip had one.
         seed: of the sensors' noise.
+        hevc: H.265 pictures in GX files, else H.264 in GH files.
     """
 
     clock: Oscillator
     true_ns: int
     frames: int
     fps: Fraction = Fraction(120000, 1001)
-    exposure_s: float | Sequence[float] = 1 / 480
+    exposure_s: float | Sequence[float] | NDArray[np.float64] = 1 / 480
     srot_ms: float = 7.0
     lead_us: int = 85_608
     skipped: tuple[int, ...] = ()
     header: dict[str, Any] = field(default_factory=dict)
     spare: int = 1
     seed: int = 0
+    hevc: bool = False
 
     @property
     def sensor_numbers(self) -> NDArray[np.int64]:
@@ -92,7 +94,7 @@ def hero9_header(**over: Any) -> dict[str, Any]:
 
 
 def write_clip(folder: Path, number: int, take: Recording, pictures: Pictures, chapter_bytes: int) -> list[Path]:
-    """Write a clip as chapters GX01nnnn.MP4, GX02nnnn.MP4, ...; a chapter ends at a key frame once it is full.
+    """Write a clip as chapters GH01nnnn.MP4, GH02nnnn.MP4, ...; a chapter ends at a key frame once it is full.
 
     Raises:
         HostError: PyAV is not installed, or the disk refuses.
@@ -100,7 +102,7 @@ def write_clip(folder: Path, number: int, take: Recording, pictures: Pictures, c
     paths: list[Path] = []
     first = 0
     while first < take.frames:
-        path = folder / f"GX{len(paths) + 1:02d}{number:04d}.MP4"
+        path = folder / f"G{'X' if take.hevc else 'H'}{len(paths) + 1:02d}{number:04d}.MP4"
         count = _encode(path, take, first, pictures, chapter_bytes)
         last = first + count >= take.frames
         _add_telemetry(path, take, first, count + (take.spare if last else 0), count)
@@ -116,11 +118,15 @@ def _encode(path: Path, take: Recording, first: int, pictures: Pictures, most_by
     except ImportError as error:
         raise HostError("the emulated camera needs PyAV", next='pip install "spikerig[video]"') from error
     starts, exposures = take.true_starts_ns, take.exposures_s
-    bytes_, done = 0, 0
-    tuning = {"preset": "ultrafast", "crf": "16", "bf": "0", "g": str(KEY_FRAME), "x264-params": "scenecut=0"}
+    bytes_ = done = height = 0
+    tuning = {"preset": "ultrafast", "crf": "16", "bf": "0", "g": str(KEY_FRAME)}
+    if take.hevc:
+        tuning["x265-params"] = f"bframes=0:scenecut=0:keyint={KEY_FRAME}:pools=none:frame-threads=1:log-level=none"
+    else:
+        tuning["x264-params"] = "scenecut=0"
     scale = {"video_track_timescale": str(take.fps.numerator)}
     with av.open(str(path), "w", format="mp4", options=scale) as container:
-        video: Any = container.add_stream("libx264", rate=take.fps, options=tuning)
+        video: Any = container.add_stream("libx265" if take.hevc else "libx264", rate=take.fps, options=tuning)
         video.codec_context.thread_count = 1  # the same bits on every run
         video.codec_context.time_base = 1 / take.fps
         for k in range(first, take.frames):
@@ -129,6 +135,8 @@ def _encode(path: Path, take: Recording, first: int, pictures: Pictures, most_by
             exposure_ns = round(float(exposures[k]) * NS)
             if not done:
                 height, width = pictures(int(starts[k]), exposure_ns, 0.0).shape[:2]
+                if width % 2 or height % 2:
+                    raise UsageError("a camera's picture has even sides", value=f"{width} x {height}")
                 video.width, video.height, video.pix_fmt = width, height, "yuvj420p"
             pixels = pictures(int(starts[k]), exposure_ns, take.srot_ms * 1e6 / height)
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24").reformat(
@@ -139,8 +147,7 @@ def _encode(path: Path, take: Recording, first: int, pictures: Pictures, most_by
                 bytes_ += packet.size
                 container.mux(packet)
             done += 1
-        for packet in video.encode():
-            container.mux(packet)
+        container.mux(video.encode())
     return done
 
 
@@ -155,7 +162,7 @@ def _add_telemetry(path: Path, take: Recording, first: int, stamped: int, frames
         _payload(take, k, min(k + per, first + stamped), first + frames) for k in range(first, first + stamped, per)
     ]  # fmt: skip
     lasts = [round(1000 * min(per, first + frames - k) / float(take.fps)) for k in range(first, first + stamped, per)]
-    offsets = (at + 8 + np.cumsum([0, *map(len, payloads[:-1])])).tolist()
+    offsets = (at + np.cumsum([0, *map(len, payloads[:-1])])).tolist()
     moov = raw[at + 8 :]
     scale = int.from_bytes(raw[raw.find(b"mvhd", at) + 16 :][:4], "big")
     track = telemetry_track(2, [len(p) for p in payloads], offsets, [max(n, 1) for n in lasts], scale)
@@ -163,7 +170,11 @@ def _add_telemetry(path: Path, take: Recording, first: int, stamped: int, frames
     cut = moov.find(b"udta") - 4  # ffmpeg's own, the last of its boxes
     moov = moov[:cut] if cut >= 0 else moov
     part = path.with_suffix(".part")
-    part.write_bytes(raw[:at] + box("mdat", *payloads) + box("moov", moov, user, track))
+    head = box("ftyp", b"mp41", bytes.fromhex("20131018"), b"mp41")  # as GoPro's; ffmpeg's is longer
+    start = raw.find(b"mdat") - 4
+    head += box("free", bytes(start - len(head) - 8))
+    media = box("mdat", raw[start + 8 : at], *payloads)  # one of them, as GoPro writes and its own reader wants
+    part.write_bytes(head + media + box("moov", moov, user, track))
     os.replace(part, path)
 
 
