@@ -79,6 +79,25 @@ def test_the_smoother_is_least_squares(constants):
     np.testing.assert_allclose(np.sqrt(np.einsum("kii->ki", cov)), sd, rtol=1e-5)
 
 
+def test_time_may_be_looked_at_backwards():
+    forth, noise = transition(7.0, Wander())
+    back, same = transition(-7.0, Wander())
+    np.testing.assert_allclose(back @ forth, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(back @ noise @ back.T, same, rtol=1e-6)
+
+
+def test_marks_far_off_are_named_and_change_nothing():
+    rng = np.random.default_rng(0)
+    x = np.sort(rng.integers(0, 100 * NS, 400))
+    y = x + np.rint(1e4 * rng.standard_normal(400)).astype(np.int64)
+    bad = rng.random(400) < 0.1
+    spoiled = track(Pairs.plain(x, y + np.where(bad, 300_000, 0), np.full(400, 1e4)))
+    np.testing.assert_array_equal(spoiled.used, ~bad)
+    without = track(Pairs.plain(x[~bad], y[~bad], np.full(int((~bad).sum()), 1e4)))
+    at = np.arange(1, 99) * NS
+    assert np.abs(spoiled.model().rig_from_device(at) - without.model().rig_from_device(at)).max() < 500
+
+
 @pytest.mark.parametrize(("x0", "y0"), [(2**62, -(2**61)), (1_700_000_000 * NS, 5), (0, 315_360_000 * NS)])
 def test_the_origin_of_time_does_not_matter(x0, y0):
     rng = np.random.default_rng(0)
