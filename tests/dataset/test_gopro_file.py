@@ -3,6 +3,7 @@
 import json
 import struct
 
+import av
 import numpy as np
 import pytest
 from gopro_clips import clip, grey
@@ -271,7 +272,6 @@ def test_a_hostile_file_is_one_clear_error(name, plain, tmp_path):
 
 def samples_agree(path):
     """Offsets and sizes of the pictures are those that FFmpeg finds."""
-    av = pytest.importorskip("av")
     track = next(t for t in read_movie(path).tracks if t.handler == "vide")
     with av.open(str(path)) as container:
         found = [(p.pos, p.size, p.pts) for p in container.demux(video=0) if p.size]
