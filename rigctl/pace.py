@@ -12,7 +12,7 @@ from spikerig.dataset.clocktime import NS
 _KNOWN_S = 2.0  # of pairs' distances together, from which a rate is told
 _BIN_BLOCKS = 4  # blocks of which the most punctual one speaks
 _BINS = 64  # kept
-_SETTLED = 3  # blocks in a row that must agree before a loss is told
+_SETTLED = 4  # blocks in a row that must agree before a loss is told
 _QUICK = 0.9  # of the time in which the camera makes a block's bytes
 _ODD = 1e-3  # no crystal is so far off: a rate like that is not taken over
 _SPREAD = 64  # blocks of which the scatter is known
@@ -139,10 +139,10 @@ class Pace:
 
     def _allowed(self, now_ns: int) -> float:
         """Lag that is no loss: scatter of the stamps, and what the rate may be off since the punctual moment."""
-        assert self._at is not None
+        since_ns = self._at[0] if self._at else now_ns
         known = len(self._jumps) >= 8
-        scatter = float(np.quantile(self._jumps, 0.9)) if known else self._rate * 200e-6
-        return 64 + 4 * scatter + self._drift * self._rate * (now_ns - self._at[0]) / NS
+        scatter = float(np.quantile(self._jumps, 0.75)) if known else self._rate * 200e-6
+        return 64 + 6 * scatter + self._drift * self._rate * (now_ns - since_ns) / NS
 
     def _fit(self, lag: float, after_ns: int, in_time: bool) -> None:
         if in_time:

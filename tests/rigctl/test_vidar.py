@@ -157,8 +157,9 @@ def test_a_busy_host_misses_no_loss_of_some_milliseconds(seed):
     inside, suspect, _ = gaps(blocks, tail=source.doubtful_bytes)
     assert inside == []
     assert suspect == [200_000] * 6
-    assert [b.lost_why for b in epochs(blocks)] == ["rate"] * 6
-    assert all(abs(b.lost_bytes - 200_000) < 20_000 for b in epochs(blocks))
+    assert {b.lost_why for b in epochs(blocks)} == {"rate"}
+    assert 6 <= len(epochs(blocks)) <= 8  # a loss may be told in two parts
+    assert abs(sum(b.lost_bytes for b in epochs(blocks)) - 1_200_000) < 100_000
 
 
 def test_a_loss_in_the_last_blocks_is_doubted_at_the_end():

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from importlib.resources import files
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any, TypeVar
 
 import numpy as np
 
 from spikerig.dataset.clocktime import NS
 from spikerig.dataset.errors import UsageError
+from spikerig.dataset.wire import WireProfile
 from spikerig.rigctl.gopro import GoProSource
 from spikerig.rigctl.gopro_http import Web
 from spikerig.rigctl.gopro_radio import Radio
@@ -130,6 +132,60 @@ def open_emulated(spec: RigSpec, plan: TakePlan, *, card: Path, after_ns: int = 
         }  # fmt: skip
 
     return Rig(host, spike, rgb, sync, world.place, truth)
+
+
+@dataclass(frozen=True, slots=True)
+class Transports:
+    """What the drivers of an emulated rig would talk to, without a scene: for finding and probing.
+
+    Args:
+        host: time.
+        usb: a pyusb backend.
+        profile: of the spike camera on it.
+        web, radio: to the GoPro.
+        ports: serial ports as `syncbox.find` takes them.
+        opener_of: of a port.
+        card: folder that stands for the RGB camera's card; whoever asked for it removes it.
+    """
+
+    host: VirtualHost
+    usb: EmulatedUsb
+    profile: WireProfile
+    web: Web
+    radio: Radio
+    ports: tuple[tuple[str, str], ...]
+    opener_of: Callable[[str], Any]
+    card: Path
+
+
+def transports_of(spec: RigSpec) -> Transports:
+    """The devices of a spec with nobody driving them; the spike camera sees a looped texture.
+
+    Args:
+        spec: the rig; `spike` may name a wire profile.
+
+    Raises:
+        UsageError: keys or values that are wrong.
+    """
+    host = VirtualHost(round(spec.start_s * NS))
+    bridge = bridge_of({"seed": spec.seed, **spec.spike}, host.now_ns(), where="spike")
+    camera, box = _camera(spec, host, _nothing, Path(mkdtemp(prefix="spikerig-card-"))), _box(spec, host)
+    web, radio = Web(AirWifi(WebServer(camera)), host), Radio(Air(camera).dial, host)
+    ports = (("emulated", "emulated"),)
+    return Transports(
+        host,
+        EmulatedUsb(host, [bridge]),
+        bridge.wire.profile,
+        web,
+        radio,
+        ports,
+        lambda _: device_errors(box.port),
+        camera.card,
+    )
+
+
+def _nothing(*_: Any) -> Any:
+    raise UsageError("an emulated rig without a scene records no pictures")
 
 
 def _camera(spec: RigSpec, host: VirtualHost, pictures: Any, card: Path) -> GoProCamera:

@@ -116,11 +116,11 @@ class EmulatedUsb:
 
     # -- handles ----------------------------------------------------------------------------------------------------
     def open_device(self, dev: Plug) -> Plug:
-        """A handle is the plug itself; it dies with it."""
+        """A handle dies with the plug it was opened on."""
         self._alive(dev)
         if dev.bridge.fault(self.host.now_ns(), "denied"):
             raise usb_error(errno.EACCES)
-        return dev
+        return Plug(dev.bridge, dev.plugged, dev.address)
 
     def close_device(self, dev_handle: Plug) -> None:
         """Interfaces go back."""
