@@ -19,6 +19,8 @@ from spikerig.dataset.framing import find_phase
 from spikerig.dataset.gopro_file import GoProClip
 from spikerig.dataset.marks import Sight, read_marks
 from spikerig.dataset.rawtake import RawTake, WireBytes
+from spikerig.rigctl.panel_framing import MOST_TICKS, panel_phase
+from spikerig.rigctl.panel_framing import SURE as PANEL_SURE
 
 LATE_TICKS = 1  # a tick's bytes leave during the tick after it was exposed (assumed: docs/hardware/vidar.md)
 SURE, VERY_SURE = 0.9, 0.999  # a framing that is less likely is not believed; one that is more ends the search
@@ -45,10 +47,16 @@ class Times:
     """
 
     def __init__(self, take: RawTake, truth: list[Mapping[str, Any]]) -> None:
-        marks = list(read_marks(take.folder / "marks.jsonl"))
+        self.marks = list(read_marks(take.folder / "marks.jsonl"))
         self.take, self.truth = take, truth
-        self.clocks: Clocks = fit_rig(marks)
-        self.sighted = {m.clock for m in marks if isinstance(m, Sight)}
+        self.missing: dict[str, str] = {}
+        self.fit([])
+
+    def fit(self, sights: Iterable[Sight]) -> None:
+        """Fit all clocks anew, with sightings beside the marks of the take."""
+        self.marks += sights
+        self.clocks: Clocks = fit_rig(self.marks)
+        self.sighted = {(m.clock, m.epoch) for m in self.marks if isinstance(m, Sight)}
 
     def spike(self, epoch: int, at_ns: int) -> ClockModel:
         """Rig time from the spike camera's own, near a time of an epoch."""
@@ -65,7 +73,7 @@ class Times:
             RefusedError: nothing ties it to the rig.
         """
         number = clip_number(name)
-        if "rgb" in self.sighted:
+        if ("rgb", number) in self.sighted:
             return RgbTimes(self.clocks.fit("rgb", number, int(clip.start_ns[0])).model, "sights")
         found = [
             (session, row)
@@ -140,10 +148,14 @@ class Framing:
     Args:
         wire: the bytes.
         spans: (epoch, first byte, byte past the last) of viewpoints: one whose picture tells is enough.
+        lit: bool[H,W], where the panel's LEDs are in the spike camera's picture; None without a panel.
     """
 
-    def __init__(self, wire: WireBytes, spans: Iterable[tuple[int, int, int]]) -> None:
+    def __init__(
+        self, wire: WireBytes, spans: Iterable[tuple[int, int, int]], lit: NDArray[np.bool_] | None = None
+    ) -> None:
         self.wire, self.profile, self.spans = wire, wire.take.profile, list(spans)
+        self.lit = None if self.profile.framing != "none" else lit
         self._offset: dict[int, int] = {}
 
     def offset(self, epoch: int) -> int:
@@ -155,21 +167,30 @@ class Framing:
         if epoch not in self._offset:
             best, sure = 0.0, set()
             for _, start, stop in [s for s in self.spans if s[0] == epoch]:
-                stop = min(stop, start + PHASE_TICKS * self.profile.tick_bytes)
+                stop = min(stop, start + MOST_TICKS * self.profile.tick_bytes)
                 data, missing = self.wire.read(epoch, start, stop)
                 if missing or len(data) < 16 * self.profile.tick_bytes:
                     continue
-                phase = find_phase(data, self.profile)
-                best = max(best, phase.confidence)
-                if phase.confidence >= SURE:
-                    sure.add((start + phase.offset) % self.profile.tick_bytes)
-                if len(sure) == 1 and phase.confidence > VERY_SURE:
+                offset, likely = self._one(data)
+                best = max(best, likely)
+                if likely >= SURE:
+                    sure.add((start + offset) % self.profile.tick_bytes)
+                if len(sure) == 1 and likely > VERY_SURE:
                     break
             if len(sure) != 1:
                 raise RefusedError(
                     "where ticks begin cannot be told",
                     value=f"epoch {epoch}, confidence {best:.2f}, {len(sure)} answers",
-                    cause="dark, uniform or noisy pictures", next="spikerig rig probe tests the wire profile",
+                    cause="dark, uniform or noisy pictures, or a panel that is not where the plan says",
+                    next="spikerig rig probe tests the wire profile",
                 )  # fmt: skip
             self._offset[epoch] = sure.pop()
         return self._offset[epoch]
+
+    def _one(self, data: NDArray[np.uint8]) -> tuple[int, float]:
+        """Offset and confidence of one stretch."""
+        if self.lit is None:
+            phase = find_phase(data[: PHASE_TICKS * self.profile.tick_bytes], self.profile)
+            return phase.offset, phase.confidence
+        offset, ratio = panel_phase(data, self.profile, self.lit)
+        return offset, 1.0 if ratio > 1.5 * PANEL_SURE else SURE if ratio >= PANEL_SURE else 0.0
