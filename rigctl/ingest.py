@@ -22,7 +22,7 @@ from spikerig.dataset.store_write import SceneWriter
 from spikerig.dataset.stream import SpikeStream
 from spikerig.dataset.wire import WireProfile
 from spikerig.dataset.wire_ticks import ticks_from_wire
-from spikerig.rigctl.ingest_sights import panel_lit, panel_mask, sights
+from spikerig.rigctl.ingest_sights import panel_mask, panel_pairs, sights
 from spikerig.rigctl.ingest_times import LATE_TICKS, Framing, Times, read_truth
 from spikerig.rigctl.ingest_truth import TrueWorld
 
@@ -95,7 +95,7 @@ def ingest(
     truth = read_truth(take)
     times = Times(take, truth)
     wire = WireBytes(take)
-    framing = Framing(wire, [s for v in views for s in v.spikes], panel_lit(take))
+    framing = Framing(wire, [s for v in views for s in v.spikes], panel_pairs(take))
     wanted = bool(truth) if config.truth is None else config.truth
     world = TrueWorld(take, times, truth) if wanted else None
     seen, times.missing = sights(take, views, times.clocks, wire, framing, begin("reading the panel", len(views)))

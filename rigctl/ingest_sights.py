@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from spikerig.calib.clock_maps import Clocks
 from spikerig.calib.panel_frames import read_frames
-from spikerig.calib.panel_read import read_spikes
+from spikerig.calib.panel_read import Spot, read_spikes
 from spikerig.dataset.clocktime import NS
 from spikerig.dataset.errors import DataError, RefusedError, UsageError
 from spikerig.dataset.gopro_file import GoProClip, open_gopro
@@ -23,7 +23,8 @@ from spikerig.dataset.rawtake import RawTake, TakenView, WireBytes
 from spikerig.dataset.stream import SpikeStream
 from spikerig.dataset.wire_ticks import ticks_from_wire
 from spikerig.rigctl.ingest_times import LATE_TICKS, Framing, clip_number
-from spikerig.rigctl.panel_view import HALO_PX, PanelPlan, mask, spots
+from spikerig.rigctl.panel_framing import complements
+from spikerig.rigctl.panel_view import PanelPlan, mask, spots
 
 BLOCK_TICKS = 4096  # read at a time
 GRAY = np.array([0.2126, 0.7152, 0.0722], np.float32)
@@ -56,12 +57,10 @@ def panel_mask(take: RawTake) -> NDArray[np.bool_] | None:
     return mask(plan.panel, plan.spike, plan.spike_radius_px, take.profile.height, take.profile.width)
 
 
-def panel_lit(take: RawTake) -> NDArray[np.bool_] | None:
-    """Pixels of the spike camera in which the panel's LEDs are, bool[H,W]; None without a panel."""
+def panel_pairs(take: RawTake) -> list[tuple[Spot, Spot]]:
+    """The panel's LEDs and their complements in the spike camera's picture; empty without a panel."""
     plan = panel_plan(take.plan)
-    if plan is None:
-        return None
-    return mask(plan.panel, plan.spike, plan.spike_radius_px - HALO_PX, take.profile.height, take.profile.width)
+    return [] if plan is None else complements(plan.panel, spots(plan.panel, plan.spike, plan.spike_radius_px))
 
 
 def sights(
