@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -68,6 +69,7 @@ class VidarSource:
         self._small = create_buffer(packet)
         self._views = [np.frombuffer(a, np.uint8) for a in self._arrays]
         self.pace = Pace(profile.bytes_s)
+        self._delayed: Callable[[], int] = getattr(host, "delayed_ns", lambda: 0)
         self.epoch = -1
         self._turn, self._index, self._streaming = 0, 0, False
         self._loss: tuple[int, str, int] = (0, "", 0)  # lost, why, suspect: for the next block to tell
@@ -97,11 +99,11 @@ class VidarSource:
         while True:
             if self._device is None and not self._return(until):
                 return None
-            before = self._host.now_ns()
+            before, delayed = self._host.now_ns(), self._delayed()
             count = self._transfer(self._arrays[self._turn], until - before)
             after = self._host.now_ns()
             if count:
-                return self._block(count, before, after)
+                return self._block(count, before, after, min(self._delayed() - delayed, after - before))
             if after >= until:
                 return None
 
@@ -129,14 +131,14 @@ class VidarSource:
         return self.pace.measured()
 
     # -- the stream -------------------------------------------------------------------------------------------------
-    def _block(self, count: int, before: int, after: int) -> Block:
-        """Bytes that came, with what was lost before them."""
+    def _block(self, count: int, before: int, after: int, delay: int) -> Block:
+        """Bytes that came, with what was lost before them; of their time `delay` was the host's own."""
         self._failed, self._retry, self._heard_ns = 0, 0, after
         data = self._views[self._turn][:count]
         self._turn ^= 1
         block = Block(data, self.epoch, self._index, before, after, *self._loss)
         self._index, self._loss = self._index + count, (0, "", 0)
-        lapse = self.pace.add(before, after, count)
+        lapse = self.pace.add(before, after, count, delay)
         if lapse is not None:  # known from now on: this block still belongs to the old epoch, at its suspect end
             self._loss = (lapse.bytes, "rate", lapse.suspect)
             self.epoch, self._index = self.epoch + 1, 0

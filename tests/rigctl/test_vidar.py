@@ -106,7 +106,7 @@ def test_a_silent_loss_is_seen_from_the_time_and_its_place_is_bounded():
     assert abs(new.lost_bytes - 5000) < 200
     assert gaps(blocks) == ([], [5000], [0])
     assert losses(bridge)["drop"] == 5000
-    assert new.suspect_bytes <= 8 * 2_097_152
+    assert new.suspect_bytes <= 0.13 * K20.bytes_s
 
 
 def test_a_late_host_without_memory_in_the_camera_loses_and_knows():
