@@ -14,6 +14,7 @@ _BIN_BLOCKS = 4  # blocks of which the most punctual one speaks
 _BINS = 64  # kept
 _SETTLED = 4  # late blocks that must agree before a loss is told,
 _WINDOW = 16  # or so many that waited in a row, whatever they say
+_PUNCTUAL_NS = 200_000  # scatter of a host not known yet, and the most that is believed
 _LEVEL = 10  # late blocks that are compared
 _DOUBT_NS = 2_000_000_000  # without one block in time: no memory bridges that
 _LASTING_NS = 100_000_000  # that it must last: a host that is slow for a moment catches up
@@ -160,7 +161,8 @@ class Pace:
 
     def _scatter(self) -> float:
         """Bytes by which one block's stamp differs from the next one's."""
-        return float(np.quantile(self._jumps, 0.75)) if len(self._jumps) >= 8 else self._rate * 200e-6
+        most = self._rate * _PUNCTUAL_NS / NS
+        return min(float(np.quantile(self._jumps, 0.75)), most) if len(self._jumps) >= 8 else most
 
     def _fit(self, lag: float, after_ns: int, in_time: bool) -> None:
         if in_time:

@@ -21,6 +21,7 @@ LEAST_BLOCK = 524_288
 _TRIES = 5  # transfers that may fail in a row before the device counts as gone
 _SILENCE_NS = NS  # without a byte: the stream is begun again
 _DRAIN_NS = NS  # at most, for what lay in the camera's memory
+_PUNCTUAL_NS = 200_000  # that a host may be late
 _BACKOFF_NS = (50_000_000, 100_000_000, 200_000_000, 500_000_000, NS)
 
 
@@ -74,7 +75,7 @@ class VidarSource:
         self._turn, self._index, self._streaming = 0, 0, False
         self._loss: tuple[int, str, int] = (0, "", 0)  # lost, why, suspect: for the next block to tell
         self._trouble, self._failed, self._silent = "", 0, False
-        self._heard_ns = self._retry = 0
+        self._heard_ns = self._retry = self._clear_ns = 0
 
     def start(self) -> None:
         """Begin the stream: flush, stream, throw old bytes away until they come at the camera's own pace."""
@@ -147,14 +148,14 @@ class VidarSource:
 
     def _new_epoch(self, why: str) -> None:
         """The stream runs again, and nothing waits: count from here; the next block tells what is missing."""
-        now = self._host.now_ns()
+        since = self._clear_ns
         lost, first, suspect = self._loss
-        lost += max(0, round(self.pace.lag(now, self.pace.total))) if why else 0
+        lost += max(0, round(self.pace.lag(since, self.pace.total))) if why else 0
         if self._index or not why:  # else the epoch before had not a single byte
             self.epoch, self._index = self.epoch + 1, 0
             suspect = self.pace.doubtful()
         self._loss = (lost, first or why, suspect)
-        self.pace.begin(now)
+        self.pace.begin(since)
 
     def _transfer(self, buffer: Any, left_ns: int) -> int:
         """One bulk read: how many bytes came. After an error the stream is caught up with, in a new epoch."""
@@ -212,6 +213,7 @@ class VidarSource:
         """
         end = self._host.now_ns() + _DRAIN_NS
         calm, came = 0, False
+        self._clear_ns = self._host.now_ns()
         while calm < 2 and self._host.now_ns() < end:
             before = self._host.now_ns()
             try:
@@ -221,8 +223,10 @@ class VidarSource:
                     raise
                 continue
             came = True
-            took = (self._host.now_ns() - before) / NS
-            calm = calm + 1 if count < 1.1 * took * self.profile.bytes_s else 0
+            late = self._host.now_ns() - before - round(count / self.profile.bytes_s * NS)
+            slack = max(_PUNCTUAL_NS, 0.1 * count / self.profile.bytes_s * NS)
+            calm = calm + 1 if abs(late) < slack else 0  # neither a backlog nor a host that let one grow
+            self._clear_ns = self._host.now_ns() - max(late, 0)
         return came
 
     def _send(self, commands: tuple[bytes, ...]) -> None:
