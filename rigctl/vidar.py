@@ -125,7 +125,8 @@ class VidarSource:
     @property
     def doubtful_bytes(self) -> int:
         """Bytes at the end of what was read that came late and have not been made up for; ask after `stop`."""
-        return self.pace.doubtful()
+        untold = self._loss[1] and not self._index  # a loss that the next block would have told
+        return self._loss[2] if untold else self.pace.doubtful()
 
     def measured_rate(self) -> Rate | None:
         """Bytes a second as they come, on the host's clock; None in the first half second."""

@@ -174,6 +174,16 @@ def test_a_loss_in_the_last_blocks_is_doubted_at_the_end():
     assert len(suspect) == 1
 
 
+def test_a_loss_that_no_block_tells_any_more_is_doubted_at_the_end():
+    host, _, _, source = opened(faults=[{"kind": "drop", "at_s": 1.0, "bytes": 5000}])
+    blocks = record(host, source, 0.9)
+    while source.epoch == 0:
+        block = source.read(100 * MS)
+        blocks.append((block, block.data.copy()))
+    source.stop()
+    assert gaps(blocks, tail=source.doubtful_bytes) == ([], [5000], [])
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_no_loss_is_unseen(seed):
     rng = np.random.default_rng(seed)
