@@ -28,6 +28,7 @@ class Arms:
         stream: spikes around the exposure, `reach` ticks and a little more on each side.
         frame: the picture, with times on the spikes' clock.
         rows: float32[h,w] sensor row of each spike pixel.
+        mid_ns: mid-exposure of the picture's middle row.
         window: ticks of the exposure.
         reach: ticks by which the exposure may be shifted.
         warp: how textures come onto the scene's camera; None where they lie on it.
@@ -39,6 +40,7 @@ class Arms:
     stream: SpikeStream
     frame: Frame
     rows: NDArray[np.float32]
+    mid_ns: int
     window: float
     reach: int
     warp: Warp | None
@@ -56,7 +58,7 @@ class Arms:
 
     def tfi(self) -> Texture:
         """TFI at mid-exposure of the middle row."""
-        at = float(np.clip(self.stream.tick_at(self.frame.mid_ns), 0, self.stream.ticks))
+        at = float(np.clip(self.stream.tick_at(self.mid_ns), 0, self.stream.ticks))
         return self._seen(tfi(self.stream, at))
 
     def aligned(self, valid: NDArray[np.bool_]) -> Aligned:
@@ -99,7 +101,8 @@ def _arms(look: ViewLook) -> Arms:
     light = linear_of(view.frame)
     good = view.valid & (view.frame.pixels < 0.98 * view.frame.full).all(2)
     rows = np.where(view.valid, view.sensor_row, np.median(view.sensor_row[view.valid])).astype(np.float32)
-    return Arms(light, good, stream, frame, rows, window, reach, scene.once("warp", lambda: _warp(scene)), scene)
+    warp = scene.once("warp", lambda: _warp(scene))
+    return Arms(light, good, stream, frame, rows, view.mid_ns, window, reach, warp, scene)
 
 
 def _warp(scene: SceneLook) -> Warp | None:

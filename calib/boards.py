@@ -194,7 +194,9 @@ def _find_charuco(gray: NDArray[np.uint8], board: Board) -> Found | None:
     import cv2
 
     scale = 2 if gray.shape[1] < SMALL else 1
-    large = gray if scale == 1 else cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    large = (
+        gray if scale == 1 else np.asarray(cv2.resize(gray, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), np.uint8)
+    )
     for old in (False, True) if board.rows % 2 else (False,):
         found = _find_pattern(large, board, old)
         if found is not None:
@@ -202,7 +204,7 @@ def _find_charuco(gray: NDArray[np.uint8], board: Board) -> Found | None:
     return None
 
 
-def _find_pattern(gray: NDArray[np.uint8], board: Board, old: bool) -> Found | None:
+def _find_pattern(gray: NDArray[Any], board: Board, old: bool) -> Found | None:
     import cv2
 
     made = cv2.aruco.CharucoBoard(

@@ -78,7 +78,7 @@ def summary(clocks: Clocks) -> dict[str, Any]:
 def _row(fit: ClockFit) -> dict[str, Any]:
     import numpy as np
 
-    inside = np.linspace(*map(float, fit.valid_ns), 201).astype(np.int64)
+    inside = np.linspace(float(fit.valid_ns[0]), float(fit.valid_ns[1]), 201).astype(np.int64)
     after = fit.valid_ns[1] + np.array([60 * 10**9])
     return {
         "clock": fit.clock, "epoch": fit.epoch, "how": fit.how, "first_ns": fit.valid_ns[0], "last_ns": fit.valid_ns[1],

@@ -181,11 +181,11 @@ def from_json(told: Any) -> Clocks:
         fits = []
         for f in told["fits"]:
             m = f["model"]
-            arrays = [np.array(m[name], kind) for name, kind in
-                      (("device_ns", np.int64), ("rig_ns", np.int64), ("sigma_ns", np.float64))]  # fmt: skip
-            if not np.isfinite(arrays[2]).all() or (arrays[2] < 0).any():
+            device, rig = np.array(m["device_ns"], np.int64), np.array(m["rig_ns"], np.int64)
+            sigma = np.array(m["sigma_ns"], np.float64)
+            if not np.isfinite(sigma).all() or (sigma < 0).any():
                 raise ValueError("a sigma is no number")
-            model = ClockModel(*arrays, float(m["drift_ppm"]))
+            model = ClockModel(device, rig, sigma, float(m["drift_ppm"]))
             rest = {k: v for k, v in f.items() if k != "model"}
             rest["valid_ns"], rest["notes"] = tuple(map(int, f["valid_ns"])), tuple(f["notes"])
             fits.append(ClockFit(model=model, **rest))

@@ -38,7 +38,7 @@ def read_pictures(clip: GoProClip, numbers: Iterable[int]) -> Iterator[tuple[int
         DataError: the video is damaged where it is read.
 
     Cost:
-        About 5 ms a frame of 1080p, and those since the key frame before it.
+        Each frame asked for is decoded, and those since the key frame before it (docs/hardware/gopro.md, "Cost").
     """
     wanted = np.unique(np.fromiter(numbers, np.int64))
     if len(wanted) and (wanted[0] < 0 or wanted[-1] >= clip.frames):

@@ -335,3 +335,20 @@ def _serial_ports() -> list[tuple[str, str]]:
 
     likely = {0x0403, 0x2E8A}  # FTDI; Raspberry Pi
     return [(port.device, port.description or "?") for port in comports() if port.vid in likely]
+
+
+def find_port(host: Host) -> str:
+    """The port of the one clock box there is.
+
+    Raises:
+        DeviceError: none answers, or several do.
+    """
+    boxes, told = find(host)
+    if len(boxes) == 1:
+        return boxes[0].address
+    raise DeviceError(
+        "no clock box answers" if not boxes else "several clock boxes answer",
+        value="; ".join(told) or "no likely port" if not boxes else ", ".join(box.address for box in boxes),
+        expected="one, or a plan that names its port",
+        next="spikerig rig find",
+    )

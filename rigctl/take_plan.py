@@ -42,6 +42,8 @@ class Rgb:
 
     Args:
         use: there is one.
+        link: "ble": started and stopped over Bluetooth; "hand": a person presses its button.
+        camera: its Bluetooth name, where there are several.
         mbit_s: of its clips, for the estimate of bytes.
         card_gb: free on its card, as read from its screen; 0: not known before it is found.
         lead_s: before and after the spikes of a viewpoint the clip runs so much longer.
@@ -49,6 +51,8 @@ class Rgb:
     """
 
     use: bool = limits(True)
+    link: str = limits("ble", choices=("ble", "hand"))
+    camera: str = limits("")
     mbit_s: float = limits(60.0, 0.1, 1000, "Mbit/s")
     card_gb: float = limits(0.0, 0, 100_000, "GB")
     lead_s: float = limits(0.5, 0, 60, "s")

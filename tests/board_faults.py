@@ -39,9 +39,9 @@ def copied(folder: Path) -> None:
 
 def moved(folder: Path) -> None:
     """The board some 20 mm elsewhere when the RGB picture was shot."""
-    poses = bp.poses(6, SEED)
+    poses = bp.poses(4, SEED)
     late = poses.copy()
-    late[:, :, 3] += np.random.default_rng(5).normal(size=(6, 3)) * 20
+    late[:, :, 3] += np.random.default_rng(5).normal(size=(4, 3)) * 20
     shoot(folder, poses, late=late)
 
 
@@ -49,24 +49,24 @@ def mirrored(folder: Path) -> None:
     """The RGB arm looks into the splitter's mirror."""
     from spikerig.dataset.images import read_image, write_image
 
-    shoot(folder, bp.poses(6, SEED))
+    shoot(folder, bp.poses(4, SEED))
     for path in sorted((folder / "b").iterdir()):
         write_image(path, np.ascontiguousarray(read_image(path)[:, ::-1]), force=True)
 
 
 CASES = (
     Case("too-few-views", "three pairs", lambda f: shoot(f, bp.poses(3, SEED))),
-    Case("flat-boards", "six pairs of boards tilted by at most 1 degree", lambda f: shoot(f, bp.poses(6, SEED, 1.0))),
+    Case("flat-boards", "four pairs of boards tilted by at most 1 degree", lambda f: shoot(f, bp.poses(4, SEED, 1.0))),
     Case("not-one-rig", "the board moved some 20 mm between the two pictures of each pair", moved),
     Case("not-one-rig", "an arm that is mirrored, and `--mirror none`", mirrored, ("--mirror", "none")),
     Case("odd-pairs", "two RGB pictures of six under each other's name", swapped),
-    Case("wrong-pattern", "`--pattern 8x5` for a board of 9x6", lambda f: shoot(f, bp.poses(5, SEED)),
-         ("--pattern", "8x5")),
+    Case("wrong-pattern", "`--pattern 10x7` for a board of 9x6", lambda f: shoot(f, bp.poses(5, SEED)),
+         ("--pattern", "10x7")),
     Case("duplicates", "a pair that is there twice", copied),
     Case("bad-corners", "a board that curls, its edges 6 mm out of plane",
-         lambda f: shoot(f, bp.poses(6, SEED), curl=1e-3)),
+         lambda f: shoot(f, bp.poses(4, SEED), curl=1e-3)),
     Case("loose-crop", "a board that curls, its edges 2 mm out of plane",
-         lambda f: shoot(f, bp.poses(6, SEED), curl=3e-4)),
+         lambda f: shoot(f, bp.poses(5, SEED), curl=3e-4)),
 )  # fmt: skip
 
 

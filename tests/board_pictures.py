@@ -36,10 +36,13 @@ class Lens:
         s, cam = self.samples, self.camera
         i, j = np.meshgrid(np.arange(s), np.arange(s))
         px = np.stack([(i + (j + 0.5) / s) / s, (j + (i + 0.5) / s) / s], -1).reshape(-1, 2)  # within a pixel
-        x, y = np.meshgrid(np.arange(cam.width), np.arange(cam.height))
-        here = np.stack([x, y], -1) + 0.5
-        middle = directions(cam, here)[..., :2]
-        by = [(directions(cam, here + h) - directions(cam, here - h))[..., :2] for h in ([0.5, 0], [0, 0.5])]
+        x, y = np.arange(cam.width + 1), np.arange(cam.height + 1)
+
+        def at(across: np.ndarray, down: np.ndarray) -> np.ndarray:
+            return directions(cam, np.stack(np.meshgrid(across, down), -1))[..., :2]
+
+        middle = at(x[:-1] + 0.5, y[:-1] + 0.5)
+        by = [np.diff(at(x, y[:-1] + 0.5), axis=1), np.diff(at(x[:-1] + 0.5, y), axis=0)]
         # within a pixel a lens is straight to 1e-4 px
         self.rays = np.stack([middle + by[0] * (a - 0.5) + by[1] * (b - 0.5) for a, b in px]).astype(np.float32)
 

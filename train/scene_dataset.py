@@ -101,7 +101,7 @@ class SceneDataset(Dataset[dict[str, Any]]):
             "valid": torch.from_numpy(np.array(view.valid)),
             "K": torch.tensor(scene.camera.K, dtype=torch.float32),
             "cam_from_world": torch.tensor(view.pose.cam_from_world, dtype=torch.float32),
-            "at_ns": torch.tensor([round(t) for t in at_ns]),
+            "at_ns": torch.tensor(at_ns),
         }
         if view.trajectory is not None or len(self.phases) == 1:
             poses = np.stack([sub_pose(view, phase) for phase in self.phases])
@@ -111,7 +111,7 @@ class SceneDataset(Dataset[dict[str, Any]]):
             item[name], item[f"{name}_known"] = torch.from_numpy(light), torch.from_numpy(known)
         return item
 
-    def _texture(self, view: View, name: str, at_ns: list[float]) -> tuple[np.ndarray, np.ndarray]:
+    def _texture(self, view: View, name: str, at_ns: list[int]) -> tuple[np.ndarray, np.ndarray]:
         if view.spikes is None:
             shape = (len(at_ns), *view.valid.shape)
             return np.zeros(shape, np.float32), np.zeros(shape, bool)
@@ -121,6 +121,6 @@ class SceneDataset(Dataset[dict[str, Any]]):
                 value=f"{self.path}: {view.name}, {view.frame.row_ns} ns a row",
                 next="align the take first",
             )
-        ticks = [view.spikes.tick_at(round(t)) for t in at_ns]
+        ticks = [view.spikes.tick_at(t) for t in at_ns]
         made = [self.straight.texture(TEXTURES[name](view.spikes, tick, self.window)) for tick in ticks]
         return np.stack([t.light for t in made]), np.stack([t.known for t in made])

@@ -108,7 +108,8 @@ def take_sharp(
         Of the effects only those that place the picture count (`PLACING`): a held-out picture has no other faults.
     """
     view, at_ns, path = _labelled(rig, number, name, plan, track, "test")
-    site = Site(*sharp.shape[:2], number, rig.seed, rig.exposure.rate_hz, camera=rig.camera, own_arm=arm is not None)
+    height, width = sharp.shape[:2]
+    site = Site(height, width, number, rig.seed, rig.exposure.rate_hz, camera=rig.camera, own_arm=arm is not None)
     placing = [effect.begin(site).rgb_optics for effect in in_order(rig.effects) if effect.name in PLACING]
     seen = optics((sharp if arm is None else arm)[None], placing)[0]
     return Taken(

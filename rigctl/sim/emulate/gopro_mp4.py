@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.clocktime import NS
-from spikerig.dataset.errors import HostError
+from spikerig.dataset.errors import HostError, UsageError
 from spikerig.dataset.mp4_boxes import read_movie
 from spikerig.rigctl.sim.draws import stream
 from spikerig.rigctl.sim.emulate.gpmf_write import box, item, nest, telemetry_track
@@ -135,6 +135,8 @@ def _encode(path: Path, take: Recording, first: int, pictures: Pictures, most_by
             exposure_ns = round(float(exposures[k]) * NS)
             if not done:
                 height, width = pictures(int(starts[k]), exposure_ns, 0.0).shape[:2]
+                if width % 2 or height % 2:
+                    raise UsageError("a camera's picture has even sides", value=f"{width} x {height}")
                 video.width, video.height, video.pix_fmt = width, height, "yuvj420p"
             pixels = pictures(int(starts[k]), exposure_ns, take.srot_ms * 1e6 / height)
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24").reformat(

@@ -91,12 +91,13 @@ def load_rig_spec(path: str | Path) -> RigSpec:
     return spec
 
 
-def open_emulated(spec: RigSpec, plan: TakePlan, *, after_ns: int = 0) -> Rig:
+def open_emulated(spec: RigSpec, plan: TakePlan, *, card: Path, after_ns: int = 0) -> Rig:
     """The rig of a spec, for a plan: its viewpoints, profile and sync mode.
 
     Args:
         spec: the rig.
         plan: what it is for.
+        card: folder that stands for the RGB camera's memory card.
         after_ns: host time of what was recorded before, for a take that is gone on with.
 
     Raises:
@@ -112,7 +113,7 @@ def open_emulated(spec: RigSpec, plan: TakePlan, *, after_ns: int = 0) -> Rig:
     bridge = bridge_of({"seed": spec.seed, **spec.spike, "profile": _wire_table(wire)}, start_ns, ticker, "spike")
     ticker.tick_ns = bridge.wire.tick_true_ns
     usb = EmulatedUsb(host, [bridge])
-    camera = _camera(spec, host, world.frame) if plan.rgb.use else None
+    camera = _camera(spec, host, world.frame, card) if plan.rgb.use else None
     box = _box(spec, host) if plan.sync.mode == "box" else None
     spike = VidarSource(wire, host, usb, serial=plan.spike.serial)
     rgb = None
@@ -168,7 +169,7 @@ def transports_of(spec: RigSpec) -> Transports:
     """
     host = VirtualHost(round(spec.start_s * NS))
     bridge = bridge_of({"seed": spec.seed, **spec.spike}, host.now_ns(), where="spike")
-    camera, box = _camera(spec, host, _nothing), _box(spec, host)
+    camera, box = _camera(spec, host, _nothing, Path(mkdtemp(prefix="spikerig-card-"))), _box(spec, host)
     web, radio = Web(AirWifi(WebServer(camera)), host), Radio(Air(camera).dial, host)
     ports = (("emulated", "emulated"),)
     return Transports(
@@ -187,12 +188,12 @@ def _nothing(*_: Any) -> Any:
     raise UsageError("an emulated rig without a scene records no pictures")
 
 
-def _camera(spec: RigSpec, host: VirtualHost, pictures: Any) -> GoProCamera:
+def _camera(spec: RigSpec, host: VirtualHost, pictures: Any, card: Path) -> GoProCamera:
     table = dict(spec.rgb)
     nature = _of(Nature, table.pop("nature", {}), "rgb.nature")
     faults = _of(RgbFaults, table.pop("faults", {}), "rgb.faults")
     clock = _clock(table, spec.seed, "gopro", "rgb")
-    card = Path(mkdtemp(prefix="spikerig-card-"))
+    card.mkdir(parents=True, exist_ok=True)
     return GoProCamera(host, card, pictures, clock, nature, faults, spec.seed)
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.dataset.clocktime import NS
 from spikerig.dataset.scene import Camera
 from spikerig.rigctl.host import Host
 from spikerig.rigctl.sim.caster.light import Stage, stage_of
@@ -96,7 +96,7 @@ class World:
         number = self.number_at(true_ns)
         if number not in self._gray:
             weights = np.asarray(self.spec.sensor.response, np.float32) * np.float32(self.spec.sensor.gain)
-            self._gray[number] = self.pictures(number) @ weights
+            self._gray[number] = np.asarray(self.pictures(number) @ weights, np.float32)
             while len(self._gray) > KEPT:
                 self._gray.popitem(last=False)
         return _between(self._gray[number], float(self.phase_at(true_ns)))
@@ -129,7 +129,7 @@ class Ticker:
 
     def __init__(self, world: World, seed: int = 0) -> None:
         self.world = world
-        self.tick_ns = lambda tick: 0
+        self.tick_ns: Callable[[int], int] = lambda tick: 0
         size = (world.camera.height, world.camera.width)
         self._account: Account = opened(stream(seed, "emulated charge").random(size))
         self._next: int | None = None
@@ -167,8 +167,3 @@ def world_of(scene: str, views: int, size: tuple[int, int], rate_hz: float, host
     )
     spec = with_changes(spec, seed=seed, views=views)
     return World(replace(spec, exposure=replace(spec.exposure, rate_hz=rate_hz, sub_poses=PICTURES)), host)
-
-
-def seconds(ns: int) -> float:
-    """Nanoseconds as seconds."""
-    return ns / NS
