@@ -125,7 +125,7 @@ def open_gopro(path: str | Path | Sequence[str | Path]) -> GoProClip:
         HostError: a file may not be read.
 
     Cost:
-        Some 10 ms and 0.5 ms a second of clip; the pictures are not read.
+        Some 10 ms and 1 ms a second of clip; the pictures are not read.
     """
     given = [Path(path)] if isinstance(path, str | Path) else [Path(p) for p in path]
     if not given:

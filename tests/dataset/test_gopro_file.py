@@ -3,11 +3,12 @@
 import json
 import struct
 
+import av
 import numpy as np
 import pytest
 from gopro_clips import clip, grey
 
-from spikerig.dataset import cli
+from spikerig.dataset import cli, gopro_pictures
 from spikerig.dataset.errors import DataError, RigError, UsageError
 from spikerig.dataset.gopro_file import chapters, open_gopro
 from spikerig.dataset.gopro_pictures import read_pictures
@@ -234,6 +235,15 @@ HOSTILE = {
 }  # fmt: skip
 
 
+CAUSES = {  # words of the cause, where another check would refuse the file too, later
+    "empty": "empty", "cut in moov": "cut off", "moov missing": "no moov", "box larger than its parent": "claims",
+    "nested 10,000 deep": "deeper than", "100,000 tiny boxes": "more than 20000 boxes", "two moov": "two moov",
+    "offset beyond the end": "beyond the end of the file", "long offset beyond the end": "beyond the end of the file",
+    "moov of 3 GB": "claims", "2^32 samples": "samples", "chunks of 2^31": "chunk", "timescale 0": "0 units",
+    "telemetry claims too much": "SHUT", "scale 0": "SCAL", "stamps that step back": "CORI",
+}  # fmt: skip
+
+
 def long_offset(raw, offset):
     """A track with one telemetry sample at a 64-bit offset, in place of all others."""
     return raw[: raw.rfind(b"moov") - 4] + box("moov", telemetry_track(1, [8], [offset], [1001], 1000))
@@ -257,6 +267,35 @@ def test_a_hostile_file_is_one_clear_error(name, plain, tmp_path):
         open_gopro(path)
     assert "bad.mp4" in str(told.value)
     assert told.value.cause
+    assert CAUSES.get(name, "") in told.value.cause
+
+
+def samples_agree(path):
+    """Offsets and sizes of the pictures are those that FFmpeg finds."""
+    track = next(t for t in read_movie(path).tracks if t.handler == "vide")
+    with av.open(str(path)) as container:
+        found = [(p.pos, p.size, p.pts) for p in container.demux(video=0) if p.size]
+    first = found[0][2]
+    assert [f[:2] for f in found] == list(zip(track.offsets.tolist(), track.sizes.tolist(), strict=True))
+    assert [f[2] - first for f in found] == (track.pts - track.pts[0]).tolist()
+
+
+def test_samples_lie_where_ffmpeg_finds_them(plain):
+    samples_agree(plain[0])
+
+
+@pytest.mark.real
+def test_samples_of_the_real_clip_lie_where_ffmpeg_finds_them(shared_data):
+    samples_agree(shared_data("gopro/max-heromode.mp4"))
+
+
+def test_a_far_picture_is_reached_from_the_key_frame_before_it(tmp_path, monkeypatch):
+    paths, _ = clip(tmp_path, frames=400)
+    seen = []
+    true = gopro_pictures._number
+    monkeypatch.setattr(gopro_pictures, "_number", lambda *a: seen.append(true(*a)) or seen[-1])
+    assert [n for n, _ in read_pictures(open_gopro(paths), [3, 390])] == [3, 390]
+    assert len(seen) < 40
 
 
 def test_long_offsets_are_read(tmp_path):

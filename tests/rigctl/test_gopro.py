@@ -259,6 +259,15 @@ def test_a_lost_answer_to_the_shutter_is_decided_by_the_state(tmp_path, which):
     wait(source, 1)
     source.stop()
     assert len(camera.truth) == 1
+    assert source.radio.dial.__self__.shutters == 2  # pressed once each, not again
+
+
+def test_stop_waits_until_it_is_idle_though_http_is_back_before(tmp_path):
+    source, camera = rig(tmp_path, nature=Nature(stop_ms=(1500, 1600), back_ms=(-1450, -1400)))
+    source.start()
+    wait(source, 1)
+    source.stop()
+    assert not camera.busy
 
 
 def test_a_link_that_breaks_while_it_records_is_mended(tmp_path):
