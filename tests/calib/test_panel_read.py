@@ -190,4 +190,4 @@ def test_words_that_are_no_neighbours_are_misread():
     assert edge(0b000, 0) == (1 * word, True)  # 0 -> 1
     assert edge(0b010, 0) == (3 * word, False)  # 011 is 2, 010 is 3
     assert edge(0b000, 1) is None  # 000 is 0, 010 is 3
-    assert edge(0b000, 2, 100 * word) == (104 * word, False)  # the wrap, the turn nearest to 100
+    assert edge(0b000, 2, 102 * word) == (104 * word, False)  # the wrap, the turn nearest to 102
