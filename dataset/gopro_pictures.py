@@ -105,7 +105,7 @@ def _pixels(path: Path, frame: Any) -> NDArray[Any]:
     matrix = _MATRIX.get(int(frame.colorspace), 1 if frame.height >= 720 else 5)
     return frame.reformat(
         format="rgb48le" if deep else "rgb24", src_colorspace=matrix, dst_color_range=2,
-        src_color_range=2 if full else 1,
+        src_color_range=2 if full else 1, threads=1,
     ).to_ndarray()  # fmt: skip
 
 

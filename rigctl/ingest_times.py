@@ -86,7 +86,7 @@ class Times:
             raise RefusedError(
                 "nothing ties this clip's frames to the rig's time", value=name,
                 expected="the LED panel in its view, read into marks.jsonl",
-                next="spikerig calib clock TAKE reads the panel; without it frames and spikes cannot be paired",
+                next="spikerig rig panel TAKE SPOTS.json reads it; without it frames and spikes cannot be paired",
             )  # fmt: skip
         session, row = found[-1]
         media, true = np.array(row["media_ns"], np.int64), np.array(row["true_ns"], np.int64)

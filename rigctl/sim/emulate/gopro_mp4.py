@@ -140,7 +140,7 @@ def _encode(path: Path, take: Recording, first: int, pictures: Pictures, most_by
                 video.width, video.height, video.pix_fmt = width, height, "yuvj420p"
             pixels = pictures(int(starts[k]), exposure_ns, take.srot_ms * 1e6 / height)
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24").reformat(
-                format="yuvj420p", dst_colorspace=1 if height >= 720 else 5, dst_color_range=2
+                format="yuvj420p", dst_colorspace=1 if height >= 720 else 5, dst_color_range=2, threads=1
             )
             frame.pts, frame.time_base = done, 1 / take.fps
             for packet in video.encode(frame):
