@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.gopro_file import GoProClip, open_gopro
 from spikerig.dataset.hdf5_guard import printable
 from spikerig.dataset.scene import Finding
@@ -53,6 +55,16 @@ def verify_clip(settings: Mapping[str, Any], clip: GoProClip | str | Path) -> li
     found = [Finding(check, kind, where, message, fix) for check, kind, message, fix in _all(wanted, read)]
     order = ("critical", "violation", "suggestion")
     return sorted(found, key=lambda f: order.index(f.importance))
+
+
+def clip_findings(settings: Mapping[str, Any], paths: Sequence[Path]) -> list[dict[str, Any]]:
+    """`verify_clip` of a recording just fetched, JSON-ready; a clip that cannot be read is a finding, too."""
+    try:
+        found = verify_clip(settings, open_gopro(paths))
+    except (DataError, UsageError) as error:
+        where = paths[0].name if paths else "clip"
+        found = [Finding("read", "critical", where, f"{error.what}: {error.value}", "take the viewpoint again")]
+    return [asdict(f) for f in found]
 
 
 def _all(wanted: Mapping[str, str], clip: GoProClip) -> Iterator[tuple[str, str, str, str]]:

@@ -53,7 +53,8 @@ def judge(checks: Checks, told: Mapping[str, Any], best_focus: float) -> list[st
 
     Args:
         checks: the plan's.
-        told: exposure, saturated, focus, lost_ticks, sync_us (None: not known), free_bytes.
+        told: exposure, saturated, focus, lost_ticks, sync_us (None: not known), free_bytes; clip_ended_early and
+            rgb_trouble (words) where there is an RGB camera.
         best_focus: of the viewpoints before.
     """
     amiss = []
@@ -73,6 +74,11 @@ def judge(checks: Checks, told: Mapping[str, Any], best_focus: float) -> list[st
         amiss.append(f"{told['lost_ticks']} ticks lost: look at cable and disk (log.jsonl)")
     if told["sync_us"] is not None and told["sync_us"] > checks.sync_us:
         amiss.append(f"clock residual {told['sync_us']:.0f} us, at most {checks.sync_us:g}: look at the clock box")
+    trouble = told.get("rgb_trouble") or ""
+    if told.get("clip_ended_early"):
+        amiss.append(f"the RGB camera stopped by itself ({trouble or 'it does not say why'}): take it again")
+    elif trouble:
+        amiss.append(f"the RGB camera: {trouble}: mend it before going on")
     if told["free_bytes"] < checks.spare_gb * 1e9:
         amiss.append(f"only {told['free_bytes'] / 1e9:.1f} GB of disk left: make room before going on")
     return amiss

@@ -15,6 +15,7 @@ from spikerig.dataset.marks import Reset
 from spikerig.dataset.rawtake import TakenView
 from spikerig.dataset.terminal import jsonable
 from spikerig.rigctl.devices import Clip, DeviceFacts, FrameSource, SpikeSource, SyncBox
+from spikerig.rigctl.gopro_check import clip_findings
 from spikerig.rigctl.host import Host
 from spikerig.rigctl.live import LOOK_TICKS, judge, look
 from spikerig.rigctl.operator import Interrupt, Operator
@@ -25,7 +26,8 @@ from spikerig.rigctl.take_writer import TakeWriter
 
 SLICE_NS = NS // 50  # between looks at whether to stop
 GO, RETAKE, SKIP, QUIT, CHECK = "", "r", "s", "q", "c"
-LOUD = ("transport", "recorder", "ring", "stopped", "silent", "device", "fault", "direct-io", "set-aside")
+LOUD = ("transport", "recorder", "ring", "stopped", "silent", "device", "fault", "direct-io", "set-aside",
+        "clip")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -174,7 +176,8 @@ class Loop:
         finally:
             state = self.recorder.state()
             epoch, seen = self.recorder.position()
-            self._event({"host_ns": self.host.now_ns(), "kind": "end", "epoch": epoch, "bytes": seen})
+            self._event({"host_ns": self.host.now_ns(), "kind": "end", "epoch": epoch, "bytes": seen,
+                         "suspect_bytes": self.recorder.doubtful_bytes})  # fmt: skip
             self.tally.bytes, self.tally.chunks = state.kept_bytes, state.chunks
             self.tally.high_water, self.tally.slots = state.high_water, state.slots
             self.tally.seconds = (self.host.now_ns() - self.began_ns) / NS
@@ -196,13 +199,17 @@ class Loop:
             attempt, tried = attempt + 1, tried + 1
             view = self._take(name, attempt)
             amiss = judge(self.plan.checks, view.checks, self.best_focus)
+            whole = bool(view.spikes) and not view.checks.get("clip_ended_early")
             view = replace(view, checks={**view.checks, "amiss": amiss})
             self.operator.say(f"  {title}: {self._figures(view.checks)}")
             for line in amiss:
                 self.operator.say(f"  !! {line}")
             if not view.spikes and self.plan.advance == "auto" and tried >= self.plan.tries:
                 raise DeviceError("the spike camera gives no bytes", value=name, next="mend it, then --resume")
-            if self._good_enough(amiss, tried, bool(view.spikes)):
+            if not whole and self.plan.advance == "auto" and tried >= self.plan.tries:
+                raise DeviceError("the RGB camera ends its recordings early", value=name,
+                                  cause=view.checks["rgb_trouble"] or None, next="mend it, then --resume")  # fmt: skip
+            if self._good_enough(amiss, tried, whole):
                 break
             self.writer.view(replace(view, kept=False))
             self.tally.retaken += 1
@@ -227,12 +234,12 @@ class Loop:
                 raise Stopped
             return answer != SKIP
 
-    def _good_enough(self, amiss: list[str], tried: int, any_spikes: bool) -> bool:
+    def _good_enough(self, amiss: list[str], tried: int, whole: bool) -> bool:
         if self.plan.advance == "auto":
             return not amiss or tried >= self.plan.tries
         keys = {GO: "keep it", RETAKE: "take it again", QUIT: "end here, without it"}
         if amiss:
-            keep = {GO: "keep it all the same"} if any_spikes else {}
+            keep = {GO: "keep it all the same"} if whole else {}
             keys = {RETAKE: keys[RETAKE], **keep, QUIT: keys[QUIT]}
         answer = self._ask("  keep?", keys)
         if answer == QUIT:
@@ -255,6 +262,7 @@ class Loop:
             self._wait(begun + round(self.plan.seconds * NS) - self.host.now_ns())
             spans = self.recorder.pause()
             self._wait(lead_ns)
+            told |= self._rgb(_rgb_state) or {}
         finally:
             spans = spans or self.recorder.pause()
             clip = self._rgb(lambda rgb: rgb.stop())
@@ -288,12 +296,18 @@ class Loop:
         for view in list(self.writer.views.values()):
             if not view.kept or view.clip is None or view.clips:
                 continue
-            told = view.clip
-            clip = Clip(told["name"], told["size_bytes"], tuple(told["start_ns"]), tuple(told["stop_ns"]))
+            made = view.clip
+            clip = Clip(made["name"], made["size_bytes"], tuple(made["start_ns"]), tuple(made["stop_ns"]))
             self.operator.say(f"  fetching {clip.name} of {view.name}, {clip.size_bytes / 1e6:.1f} MB")
             self._stop_if_asked()
             paths = self._rgb(lambda rgb, clip=clip: rgb.fetch(clip, self.writer.folder / "rgb"))
-            self.writer.view(replace(view, clips=tuple(p.name for p in paths)))
+            found = clip_findings(self.plan.rgb.settings, paths)
+            checks = {**view.checks, "clip": found}
+            self.writer.view(replace(view, clips=tuple(p.name for p in paths), checks=checks))
+            for told in found:
+                words = f"{told['importance']}: {view.name}, {told['where']}: {told['message']}"
+                at_ns = self.host.now_ns()
+                self._event({"host_ns": at_ns, "kind": "clip", "view": view.name, **told, "words": words})
 
     # small things
 
@@ -342,6 +356,12 @@ class Loop:
         self.writer.log(told)
         if told["kind"] in LOUD:
             self.operator.say(f"  !! {told.get('words', told['kind'])}")
+
+
+def _rgb_state(rgb: FrameSource) -> dict[str, Any]:
+    """What the RGB camera says while its recording should still run."""
+    told = rgb.poll()
+    return {"clip_ended_early": bool(told.get("ended_early")), "rgb_trouble": str(told.get("trouble") or "")}
 
 
 def write_truth(folder: Path, truth: Mapping[str, Any]) -> None:

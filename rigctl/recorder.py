@@ -198,6 +198,11 @@ class Recorder:
         """No byte will be read or written any more: the reader ended, or the disk failed."""
         return bool(self._trouble) and self._trouble != SLOW
 
+    @property
+    def doubtful_bytes(self) -> int:
+        """Bytes at the end of what came that may lie behind a loss; of a source that can tell, once closed."""
+        return int(getattr(self.source, "doubtful_bytes", 0))
+
     def progress(self) -> list[tuple[int, int, int]]:
         """New since the last call: (epoch, bytes of it, host time after), the most punctual transfer of each 50 ms."""
         with self._lock:

@@ -232,3 +232,33 @@ def test_each_check_speaks(told: dict, word: str) -> None:
     assert judge(Checks(), good, 1.0) == []
     (line,) = judge(Checks(), good | told, 1.0)
     assert word in line
+
+
+def test_a_fetched_clip_that_is_not_as_asked_is_told(tmp_path: Path) -> None:
+    calm, operator = tmp_path / "calm", Scripted()
+    take(calm, plan_of(viewpoints=1))
+    assert open_take(calm).views()[0].checks["clip"] == []
+    assert not log(calm, "clip")
+    folder = tmp_path / "take"
+    tally = take(folder, plan_of(viewpoints=1), operator, rgb={"faults": {"forgets": [145]}})
+    assert tally.kept == 1
+    found = open_take(folder).views()[0].checks["clip"]
+    assert [(f["check"], f["importance"]) for f in found] == [("shutter", "violation")]
+    assert [told["check"] for told in log(folder, "clip")] == ["shutter"]
+    assert any("1/240 s was asked for" in line for line in operator.said)
+
+
+def test_a_recording_that_ends_early_is_not_kept(tmp_path: Path) -> None:
+    calm, folder = tmp_path / "calm", tmp_path / "take"
+    plan = plan_of(viewpoints=1, seconds=0.5)
+    take(calm, plan)
+    clip = open_take(calm).views()[0].clip
+    at_s = (clip["start_ns"][1] + 250_000_000) / 1e9 - 1000.0
+    operator = Scripted()
+    tally = take(folder, plan, operator, rgb={"faults": {"too_hot_s": at_s}})
+    lines = [t for _, t in read_lines(folder / "views.jsonl")]
+    assert [line["kept"] for line in lines] == [False, True, True]  # taken again; told once more with its clip
+    assert [line["checks"]["clip_ended_early"] for line in lines] == [True, False, False]
+    assert tally.retaken == 1
+    assert "too hot" in tally.poor["000"][0]  # a camera that is still hot is told
+    assert any("stopped by itself (it is too hot)" in said for said in operator.said)
