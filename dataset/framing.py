@@ -215,6 +215,22 @@ class Watch:
         return Slip(self._epoch, seen, byte_index + len(part), (start - int(like[0])) % m1k40.FRAME, 1.0)
 
 
+def seam_scores(data: Bytes, profile: WireProfile) -> Rates:
+    """Of every byte, how likely a tick begins there, by the picture's edges; of several stretches they may be added.
+
+    Args:
+        data: uint8[n], at least 16 ticks.
+        profile: of the wire, without tags.
+
+    Returns:
+        float64[tick_bytes], ln of likelihood ratios.
+
+    Raises:
+        DataError: too few ticks.
+    """
+    return _seams(fold(data, profile.tick_bytes)[0], profile)
+
+
 def _seams(rates: Rates, profile: WireProfile) -> Rates:
     """ln of the likelihood ratio of every byte to be a tick's first, by what meets across rows and columns."""
     row, width, n = profile.row_bits, profile.width, len(rates)
