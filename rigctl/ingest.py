@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from spikerig.dataset.stream import SpikeStream
 from spikerig.dataset.wire import WireProfile
 from spikerig.dataset.wire_ticks import ticks_from_wire
 from spikerig.rigctl.ingest_sights import panel_mask, panel_pairs, sights
+from spikerig.rigctl.ingest_slips import MendedBytes
 from spikerig.rigctl.ingest_times import LATE_TICKS, Framing, Times, read_truth
 from spikerig.rigctl.ingest_truth import TrueWorld
 
@@ -94,7 +95,8 @@ def ingest(
         raise DataError("the take has no viewpoint that was kept", value=take.folder)
     truth = read_truth(take)
     times = Times(take, truth)
-    wire = WireBytes(take)
+    wire = MendedBytes(take, [s for v in views for s in v.spikes])
+    views = [replace(v, spikes=tuple((e, wire.sent(e, a), wire.sent(e, b)) for e, a, b in v.spikes)) for v in views]
     framing = Framing(wire, [s for v in views for s in v.spikes], panel_pairs(take))
     wanted = bool(truth) if config.truth is None else config.truth
     world = TrueWorld(take, times, truth) if wanted else None
@@ -107,7 +109,7 @@ def ingest(
     info = _info(take, times, config, world is not None)
     told: dict[str, Any] = {
         "views": 0, "test": [], "left_out": {}, "lost_ticks": 0, "sigma_us": 0.0, "rgb_times": {},
-        "sights": len(seen), "panel_unread": times.missing,
+        "sights": len(seen), "panel_unread": times.missing, "slips": [asdict(s) for s in wire.slips],
     }  # fmt: skip
     done = begin("cutting", len(views))
     hidden = panel_mask(take)
@@ -129,7 +131,7 @@ def ingest(
             raise DataError("no view can be made of this take", value="; ".join(
                 dict.fromkeys(told["left_out"].values())))  # fmt: skip
         info["clocks"]["rgb"] = told["rgb_times"]
-        writer.info = {**info, "left_out": told["left_out"]}
+        writer.info = {**info, "left_out": told["left_out"], "slips": told["slips"]}
         if world:
             writer.points = world.points()
     return {"scene": str(out), **told}

@@ -12,7 +12,7 @@ from spikerig.calib.panel_read import Spot
 from spikerig.dataset.cli import run
 from spikerig.dataset.errors import DataError, RefusedError, UsageError
 from spikerig.dataset.kernels import count
-from spikerig.dataset.rawtake import WireBytes, open_take, read_lines
+from spikerig.dataset.rawtake import WireBytes, open_take, read_lines, verify_take
 from spikerig.dataset.segments import Chunk, scan
 from spikerig.dataset.store import open_scene, verify_scene
 from spikerig.rigctl.ingest import IngestConfig, ingest
@@ -208,3 +208,24 @@ def test_the_panel_ties_frames_and_spikes_without_any_truth(tmp_path: Path) -> N
         assert np.abs(off).min() < 300_000
         assert not view.valid[5, 6]  # an LED
         assert view.valid[48, 64]
+
+
+@pytest.mark.parametrize("lost", [12, 28])
+def test_a_loss_that_time_cannot_see_becomes_lost_ticks(taken: Path, tmp_path: Path, lost: int) -> None:
+    view = open_take(taken).views()[1]
+    calm_s = (view.clip["start_ns"][1] + 75_000_000) / 1e9 - 1000.0  # within its spikes
+    folder = tmp_path / "take"
+    take(folder, plan_of(test_every=3), spike={"faults": [{"kind": "drop", "at_s": calm_s, "bytes": lost}]})
+    assert verify_take(folder)[0] == []  # time told nothing
+    (hole,) = [x for x in json.loads((folder / "truth.json").read_text())[0]["spike"][0]["lost"] if x["why"] == "drop"]
+    told = ingest(folder, tmp_path / "s.h5")
+    (slip,) = told["slips"]
+    assert slip["lost"] == lost
+    assert told["left_out"] == {}
+    first = first_byte(folder) + lost  # "end" counts what came
+    assert slip["after"] <= hole["start"] - first <= slip["before"]
+    with open_scene(tmp_path / "s.h5") as file:
+        scene = file.read()
+    ((a, b),) = scene.view("001").spikes.lost
+    assert 0 < b - a <= 100
+    assert told["lost_ticks"] == b - a
