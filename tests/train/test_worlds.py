@@ -251,7 +251,7 @@ def test_results_are_laid_out_as_nerfbaselines_reads_them(tiny, oracle, tmp_path
     assert score(capsys, oracle, "--nerfbaselines", out, code=2)["error"]["type"] == "UsageError"
 
 
-def test_tiny_and_equal_pictures_are_graded(tiny, oracle):
+def test_equal_pictures_are_graded(tiny, oracle):
     model = open_run(oracle).model
     with open_scene(tiny) as scene:
         exam = novel_views(scene)[0][0]
