@@ -297,7 +297,9 @@ def test_rankiqas_vgg16_is_found_under_both_names(names, tmp_path, monkeypatch):
     monkeypatch.setattr(judges, "_tensors", lambda path: made)
     expected = ((25088 * 28 * 1e-3 + 0.5) * 4096 * 1e-3 + 0.5) * 4096 * -1e-2 + 0.5
     judge = open_rankiqa(tmp_path / "w", trust=False)
-    assert judge(np.zeros((224, 224, 3), np.uint8)) == pytest.approx(expected, rel=1e-3)  # float32 sums of 25088 equal terms
+    assert judge(np.zeros((224, 224, 3), np.uint8)) == pytest.approx(
+        expected, rel=1e-3
+    )  # float32 sums of 25088 equal terms
     made.pop(next(k for k in made if k.startswith("classifier")))
     with pytest.raises(DataError, match="not the weights of RankIQA"):
         open_rankiqa(tmp_path / "w", trust=False)

@@ -9,15 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from spikerig.calib.gauge import Similarity
+from spikerig.calib.gauge import Similarity, similarity
 from spikerig.dataset.cli import run
 from spikerig.dataset.errors import DataError, NumericsError
 from spikerig.dataset.images import read_image
 from spikerig.dataset.scene import Pose
 from spikerig.dataset.store import open_scene, write_scene
+from spikerig.train import metrics
 from spikerig.train.bridge import bridge
 from spikerig.train.config import configure
 from spikerig.train.model import Model
+from spikerig.train.nerfbaselines import write_results
 from spikerig.train.realign import realign, twist_gradient
 from spikerig.train.record import open_run
 from spikerig.train.run import run_fit
@@ -101,10 +103,11 @@ def test_estimates_in_the_same_file_meet_its_true_held_out_poses(tiny, tmp_path,
     """As `calib poses --write` leaves it: estimated training poses, and a truth that knows the real ones."""
     with open_scene(tiny) as file:
         scene = file.read()
-    views = [
-        replace(v, pose=Pose(ELSEWHERE.poses(v.pose.cam_from_world[None])[0]), trajectory=None) if v.split == "train"
-        else v for v in scene.views
-    ]  # fmt: skip
+    views = []
+    for v in scene.views:
+        pose = v.pose.cam_from_world  # a held-out pose as stored may be anything: the truth knows better
+        off = compose(exp_se3(20 * NUDGE), pose) if v.split == "test" else ELSEWHERE.poses(pose[None])[0]
+        views.append(replace(v, pose=Pose(off), trajectory=None))
     rgb_points = replace(scene.points, xyz=ELSEWHERE.points(scene.points.xyz))
     written = replace(scene, views=tuple(views), points=rgb_points, info={**scene.info, "poses": {"versions": {}}})
     write_scene(tmp_path / "estimated.h5", written)
@@ -138,6 +141,17 @@ def test_bridge_refuses_what_cannot_be_fitted():
     still = dict.fromkeys("0123", many["0"])
     with pytest.raises(DataError):
         bridge(still, far, estimated=True)
+
+
+def test_bridge_is_fitted_to_every_camera():
+    many = cameras(6)
+    rng = np.random.default_rng(2)
+    rough = {k: compose(exp_se3(rng.normal(0, 0.02, 6)), p) for k, p in many.items()}
+    found = bridge(many, rough | {"more": many["0"]}, estimated=True)
+    whole = similarity(np.stack([many[k] for k in sorted(many)]), np.stack([rough[k] for k in sorted(many)]))
+    assert found.cameras == 6
+    assert found.to_run is not None
+    assert np.array_equal(found.to_run.t, whole.t)
 
 
 def test_small_differences_of_exact_poses_are_told_not_fitted():
@@ -249,6 +263,20 @@ def test_results_are_laid_out_as_nerfbaselines_reads_them(tiny, oracle, tmp_path
     assert results["render_dataset_metadata"]["scene"] == "tiny"
     assert json.loads((out / "predictions/info.json").read_text())["evaluation_protocol"] == "default"
     assert score(capsys, oracle, "--nerfbaselines", out, code=2)["error"]["type"] == "UsageError"
+
+
+def test_predictions_are_in_the_order_of_their_files(tmp_path):
+    """a-1.png sorts before a.png, though "a" sorts before "a-1"."""
+    rng = np.random.default_rng(0)
+    made = {n: rng.integers(0, 256, (2, 12, 12, 3), np.uint8) for n in ("b", "a", "a-1")}
+    about = {"method": "m", "dataset": "d", "scene": "s", "steps": 1, "seconds": None, "config": {}, "background": None,
+             "checkpoint_sha256": None}  # fmt: skip
+    out = write_results(tmp_path, [(n, *pair) for n, pair in made.items()], about, None)
+    results = json.loads(out.read_text())
+    psnr = struct.unpack("<3f", base64.b64decode(results["metrics_raw"]["psnr"]))
+    assert psnr == pytest.approx([metrics.psnr(*made[n]) for n in ("a-1", "a", "b")], rel=1e-6)
+    data = b"".join((tmp_path / "predictions/color" / f"{n}.png").read_bytes() for n in ("a-1", "a", "b"))
+    assert results["predictions_sha256"] == hashlib.sha256(data).hexdigest()
 
 
 def test_equal_pictures_are_graded(tiny, oracle):
