@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.scene import Floats
+from spikerig.dataset.terminal import note
 from spikerig.train import metrics
 from spikerig.train.bridge import Bridge, Cameras, bridge, stored_cameras, true_pose
 from spikerig.train.metrics import SSIM_VARIANTS, rounded
@@ -229,6 +230,9 @@ def score_run(
     novel, blurred, gauge = bring_over(scene, novel, blurred, trained, estimated)
     if align_steps is None:
         align_steps = STEPS if estimated or (gauge is not None and not gauge["same_world"]) else 0
+    if align_steps and not hasattr(model, "draw"):
+        note(f"cameras are not aligned: the field '{model.config.field}' gives no gradient of a pose")
+        align_steps = 0
     graded = grade(model, novel, ssim=ssim, judges=judges, keep=keep) if novel else None
     aligned = grade_aligned(model, novel, align_steps, ssim=ssim, judges=judges) if novel and align_steps else None
     alone = None
