@@ -45,9 +45,14 @@ class Follower:
             return "used"
         told_ns, sigma = self.predict(x_ns)
         off = float(y_ns - told_ns)
-        if abs(off) > max(self.least_ns, FAR * float(np.hypot(sigma, sd_ns))):
+        limit = max(self.least_ns, FAR * float(np.hypot(sigma, sd_ns)))
+        if abs(off) > limit:
             self.far.append((x_ns, y_ns, sd_ns))
             return self._judged()
+        if self.far:
+            x, y, _ = self.far[-1]
+            if abs(off - (y - self.predict(x)[0])) <= limit:
+                return "far"  # too poor to tell the old course from the new one
         self.far.clear()
         self._update(x_ns, off, sd_ns)
         return "used"

@@ -8,12 +8,15 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from spikerig.dataset.errors import DeviceError, HostError, UsageError
 from spikerig.dataset.terminal import emit, note
+
+if TYPE_CHECKING:
+    from spikerig.rigctl.host import Host
 
 
 def clock(
@@ -104,7 +107,7 @@ def _opener(port: str | None, emulate: bool) -> Callable[[Any], Callable[[], Any
     return of
 
 
-def _emulated(host: Any) -> Callable[[], Any]:
+def _emulated(host: Host) -> Callable[[], Any]:
     from spikerig.rigctl.sim.emulate.harpbox import HarpBoxWire
     from spikerig.rigctl.sim.emulate.oscillator import Oscillator
     from spikerig.rigctl.sim.emulate.serialport import device_errors
@@ -119,8 +122,9 @@ def _emulated(host: Any) -> Callable[[], Any]:
 class _Since:
     """A host whose time began at `begun_ns` of another."""
 
-    def __init__(self, host: Any, begun_ns: int) -> None:
-        self._host, self._begun_ns = host, begun_ns
+    def __init__(self, host: Host, begun_ns: int) -> None:
+        self._begun_ns = begun_ns
+        self._host, self.suspended_ns, self.worker, self.aside = host, host.suspended_ns, host.worker, host.aside
 
     def now_ns(self) -> int:
         """The time since then."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from spikerig.dataset.store_write import SceneWriter
 from spikerig.dataset.stream import SpikeStream
 from spikerig.dataset.wire import WireProfile
 from spikerig.dataset.wire_ticks import ticks_from_wire
+from spikerig.rigctl.ingest_sights import panel_mask, panel_pairs, sights
 from spikerig.rigctl.ingest_times import LATE_TICKS, Framing, Times, read_truth
 from spikerig.rigctl.ingest_truth import TrueWorld
 
@@ -51,12 +52,14 @@ class IngestConfig:
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """A frame of a view and the RGB sensor's row of each of its rows, and the spikes around it, in rig time."""
+    """A frame of a view, the RGB sensor's row of each of its rows, the spikes around it, all in rig time; how good
+    the clocks are, and what tied the frame to rig time ("sights" or "truth")."""
 
     frame: Frame
     rows: NDArray[np.float32]
     spikes: SpikeStream
     sigma_ns: float
+    how: str
 
 
 def ingest(
@@ -65,7 +68,7 @@ def ingest(
     config: IngestConfig | None = None,
     *,
     force: bool = False,
-    begin: Callable[[int], Callable[[], None]] = lambda total: lambda: None,
+    begin: Callable[[str, int], Callable[[], None]] = lambda what, total: lambda: None,
 ) -> dict[str, Any]:
     """Make a scene of a take.
 
@@ -74,7 +77,7 @@ def ingest(
         out: the scene; it appears whole or not at all.
         config: how.
         force: replace an existing scene.
-        begin: called with the number of views; gives what is called after each.
+        begin: called with what begins and the number of viewpoints; gives what is called after each.
 
     Returns:
         JSON-ready: views, those left out and why, lost ticks, how the clocks were tied, their uncertainty.
@@ -92,15 +95,22 @@ def ingest(
     truth = read_truth(take)
     times = Times(take, truth)
     wire = WireBytes(take)
-    framing = Framing(wire, [s for v in views for s in v.spikes])
+    framing = Framing(wire, [s for v in views for s in v.spikes], panel_pairs(take))
     wanted = bool(truth) if config.truth is None else config.truth
     world = TrueWorld(take, times, truth) if wanted else None
+    seen, times.missing = sights(take, views, times.clocks, wire, framing, begin("reading the panel", len(views)))
+    if seen:
+        times.fit(seen)
     size = take.profile
     camera = world.camera if world else Camera.pinhole(size.width, size.height, config.fov_deg)
     held = _held_out(take, config)
     info = _info(take, times, config, world is not None)
-    told: dict[str, Any] = {"views": 0, "test": [], "left_out": {}, "lost_ticks": 0, "sigma_us": 0.0}
-    done = begin(len(views))
+    told: dict[str, Any] = {
+        "views": 0, "test": [], "left_out": {}, "lost_ticks": 0, "sigma_us": 0.0, "rgb_times": {},
+        "sights": len(seen), "panel_unread": times.missing,
+    }  # fmt: skip
+    done = begin("cutting", len(views))
+    hidden = panel_mask(take)
     more = {"light_gain": world.light_gain, "truth": world.truth} if world else {}
     with SceneWriter(out, config.name or str(take.plan["name"]), camera, **more, force=force, keep=False) as writer:
         for view in views:
@@ -112,40 +122,39 @@ def ingest(
                 continue
             for number, cut in enumerate(cuts):
                 name = view.name if config.frames == 1 else f"{view.name}-{number}"
-                _add(writer, name, view, cut, "test" if view.name in held else "train", world, told)
+                split = "test" if view.name in held else "train"
+                _add(writer, _plain(name, cut, split, hidden), view, cut, world, told)
             done()
         if not told["views"]:
             raise DataError("no view can be made of this take", value="; ".join(
                 dict.fromkeys(told["left_out"].values())))  # fmt: skip
-        told["rgb_times"] = info["clocks"]["rgb"] = times_of(told)
+        info["clocks"]["rgb"] = told["rgb_times"]
         writer.info = {**info, "left_out": told["left_out"]}
         if world:
             writer.points = world.points()
     return {"scene": str(out), **told}
 
 
-def times_of(told: Mapping[str, Any]) -> str:
-    """How frames were tied to rig time, as the views said."""
-    return str(told.get("how", "sights"))
+def _plain(name: str, cut: Cut, split: Any, hidden: NDArray[np.bool_] | None) -> View:
+    """A view without its pose; pixels that the panel lights are not valid."""
+    height, width = cut.frame.pixels.shape[:2]
+    rows = np.repeat(cut.rows[:, None], width, 1)
+    valid = np.ones((height, width), bool) if hidden is None else ~hidden
+    return View(name, cut.frame, cut.spikes, rows, valid, Pose(np.eye(3, 4)), None, split)
 
 
 def _add(
-    writer: SceneWriter, name: str, view: TakenView, cut: Cut, split: Any, world: TrueWorld | None, told: dict[str, Any]
+    writer: SceneWriter, plain: View, view: TakenView, cut: Cut, world: TrueWorld | None, told: dict[str, Any]
 ) -> None:
-    height, width = cut.frame.pixels.shape[:2]
-    rows = np.repeat(cut.rows[:, None], width, 1)
-    plain = View(
-        name, cut.frame, cut.spikes, rows, np.ones((height, width), bool), Pose(np.eye(3, 4)), None, split
-    )  # fmt: skip
     told["lost_ticks"] += int((cut.spikes.lost[:, 1] - cut.spikes.lost[:, 0]).sum())
     told["sigma_us"] = max(told["sigma_us"], cut.sigma_ns / 1e3)
+    told["rgb_times"][cut.how] = told["rgb_times"].get(cut.how, 0) + 1
     told["views"] += 1
-    if split == "test":
-        told["test"].append(name)
+    if plain.split == "test":
+        told["test"].append(plain.name)
     if world is None:
         writer.add(plain)
         return
-    told["how"] = "truth"
     true = world.view(plain, view)
     writer.add(true.view, light=true.light, at_ns=true.at_ns, trajectory=true.trajectory)
 
@@ -166,7 +175,8 @@ def cut_view(
     clip = open_gopro([take.folder / "rgb" / name for name in view.clips])
     if clip.exposure_ns is None or clip.row_ns is None:
         raise DataError("the clip does not tell exposures or read-out", value=view.clips[0])
-    rgb = times.rgb(clip, view.clips[0], int(view.clip["start_ns"][0])).model
+    tied = times.rgb(clip, view.clips[0], int(view.clip["start_ns"][0]))
+    rgb = tied.model
     epoch, start, stop = max(view.spikes, key=lambda s: s[2] - s[1])
     profile = take.profile
     offset = framing.offset(epoch)
@@ -186,7 +196,7 @@ def cut_view(
         sigma = float(np.hypot(spike.sigma_at(device_ns(profile, start)), rgb.sigma_at(int(clip.start_ns[number]))))
         rows = (np.arange(profile.height, dtype=np.float32) + 0.5) * (clip.height / profile.height) - 0.5
         spikes = _spikes(wire, epoch, offset, t0, t1, rig_of)
-        cuts.append(Cut(_sized(frame, starts, profile), rows, spikes, sigma))
+        cuts.append(Cut(_sized(frame, starts, profile), rows, spikes, sigma, tied.how))
     return cuts
 
 

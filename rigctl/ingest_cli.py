@@ -35,14 +35,16 @@ def ingest(
         raise UsageError("a number is out of range", value=(frames, margin_ticks, test_every),
                          expected="1 to 1000 frames, 0 to 1000000 ticks, test-every from 0")  # fmt: skip
     config = IngestConfig(frames, margin_ticks, test_every, fov_deg, truth, name)
-    told = run(take, out, config, force=force, begin=lambda n: Progress("cutting", n, "viewpoints").step)
+    told = run(take, out, config, force=force, begin=lambda what, n: Progress(what, n, "viewpoints").step)
     if as_json:
         emit("spikerig.data.ingest/1", told)
+    for view, why in told["panel_unread"].items():
+        note(f"  the panel was not read: {view}: {why}")
     for view, why in told["left_out"].items():
         note(f"  left out: {view}: {why}")
     note(
         f"{out}: {told['views']} views ({len(told['test'])} held out), {told['lost_ticks']} ticks lost, frames timed "
-        f"by {told['rgb_times']}, clocks good to {2 * told['sigma_us']:.0f} us"
+        f"by {' and '.join(told['rgb_times'])}, clocks good to {2 * told['sigma_us']:.0f} us"
     )
     if told["left_out"]:
         raise typer.Exit(1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 
 from spikerig.calib.clock import fit_rig
 from spikerig.calib.clock_maps import Clocks
+from spikerig.calib.panel_read import Spot
 from spikerig.dataset.clocktime import ClockModel
 from spikerig.dataset.errors import DataError, RefusedError
 from spikerig.dataset.framing import find_phase
 from spikerig.dataset.gopro_file import GoProClip
 from spikerig.dataset.marks import Sight, read_marks
 from spikerig.dataset.rawtake import RawTake, WireBytes
+from spikerig.rigctl.panel_framing import MOST_TICKS, best_of, panel_scores
 
 LATE_TICKS = 1  # a tick's bytes leave during the tick after it was exposed (assumed: docs/hardware/vidar.md)
 SURE, VERY_SURE = 0.9, 0.999  # a framing that is less likely is not believed; one that is more ends the search
@@ -45,10 +47,16 @@ class Times:
     """
 
     def __init__(self, take: RawTake, truth: list[Mapping[str, Any]]) -> None:
-        marks = list(read_marks(take.folder / "marks.jsonl"))
+        self.marks = list(read_marks(take.folder / "marks.jsonl"))
         self.take, self.truth = take, truth
-        self.clocks: Clocks = fit_rig(marks)
-        self.sighted = {m.clock for m in marks if isinstance(m, Sight)}
+        self.missing: dict[str, str] = {}
+        self.fit([])
+
+    def fit(self, sights: Iterable[Sight]) -> None:
+        """Fit all clocks anew, with sightings beside the marks of the take."""
+        self.marks += sights
+        self.clocks: Clocks = fit_rig(self.marks)
+        self.sighted = {(m.clock, m.epoch) for m in self.marks if isinstance(m, Sight)}
 
     def spike(self, epoch: int, at_ns: int) -> ClockModel:
         """Rig time from the spike camera's own, near a time of an epoch."""
@@ -65,7 +73,7 @@ class Times:
             RefusedError: nothing ties it to the rig.
         """
         number = clip_number(name)
-        if "rgb" in self.sighted:
+        if ("rgb", number) in self.sighted:
             return RgbTimes(self.clocks.fit("rgb", number, int(clip.start_ns[0])).model, "sights")
         found = [
             (session, row)
@@ -78,7 +86,7 @@ class Times:
             raise RefusedError(
                 "nothing ties this clip's frames to the rig's time", value=name,
                 expected="the LED panel in its view, read into marks.jsonl",
-                next="spikerig calib clock TAKE reads the panel; without it frames and spikes cannot be paired",
+                next="spikerig rig panel TAKE SPOTS.json reads it; without it frames and spikes cannot be paired",
             )  # fmt: skip
         session, row = found[-1]
         media, true = np.array(row["media_ns"], np.int64), np.array(row["true_ns"], np.int64)
@@ -140,10 +148,14 @@ class Framing:
     Args:
         wire: the bytes.
         spans: (epoch, first byte, byte past the last) of viewpoints: one whose picture tells is enough.
+        pairs: the panel's LEDs and their complements in the spike camera's picture; empty without a panel.
     """
 
-    def __init__(self, wire: WireBytes, spans: Iterable[tuple[int, int, int]]) -> None:
+    def __init__(
+        self, wire: WireBytes, spans: Iterable[tuple[int, int, int]], pairs: Sequence[tuple[Spot, Spot]] = ()
+    ) -> None:
         self.wire, self.profile, self.spans = wire, wire.take.profile, list(spans)
+        self.pairs = pairs if self.profile.framing == "none" else ()
         self._offset: dict[int, int] = {}
 
     def offset(self, epoch: int) -> int:
@@ -153,23 +165,41 @@ class Framing:
             RefusedError: no picture tells, or two that seem sure differ.
         """
         if epoch not in self._offset:
-            best, sure = 0.0, set()
-            for _, start, stop in [s for s in self.spans if s[0] == epoch]:
-                stop = min(stop, start + PHASE_TICKS * self.profile.tick_bytes)
-                data, missing = self.wire.read(epoch, start, stop)
-                if missing or len(data) < 16 * self.profile.tick_bytes:
-                    continue
-                phase = find_phase(data, self.profile)
-                best = max(best, phase.confidence)
-                if phase.confidence >= SURE:
-                    sure.add((start + phase.offset) % self.profile.tick_bytes)
-                if len(sure) == 1 and phase.confidence > VERY_SURE:
-                    break
-            if len(sure) != 1:
+            told = self._by_panel(epoch) if self.pairs else self._by_seam(epoch)
+            if told is None:
                 raise RefusedError(
-                    "where ticks begin cannot be told",
-                    value=f"epoch {epoch}, confidence {best:.2f}, {len(sure)} answers",
-                    cause="dark, uniform or noisy pictures", next="spikerig rig probe tests the wire profile",
+                    "where ticks begin cannot be told", value=f"epoch {epoch}",
+                    cause="dark, uniform or noisy pictures, or a panel that is not where the plan says",
+                    next="spikerig rig probe tests the wire profile",
                 )  # fmt: skip
-            self._offset[epoch] = sure.pop()
+            self._offset[epoch] = told
         return self._offset[epoch]
+
+    def _stretches(self, epoch: int) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        """First bytes and whole stretches of an epoch's viewpoints."""
+        for _, start, stop in [s for s in self.spans if s[0] == epoch]:
+            data, missing = self.wire.read(epoch, start, min(stop, start + MOST_TICKS * self.profile.tick_bytes))
+            if not missing and len(data) >= 16 * self.profile.tick_bytes:
+                yield start, data
+
+    def _by_seam(self, epoch: int) -> int | None:
+        sure = set()
+        for start, data in self._stretches(epoch):
+            phase = find_phase(data[: PHASE_TICKS * self.profile.tick_bytes], self.profile)
+            if phase.confidence >= SURE:
+                sure.add((start + phase.offset) % self.profile.tick_bytes)
+            if len(sure) == 1 and phase.confidence > VERY_SURE:
+                break
+        return sure.pop() if len(sure) == 1 else None
+
+    def _by_panel(self, epoch: int) -> int | None:
+        total = np.zeros(self.profile.tick_bytes)
+        best, sure = 0, False
+        for seen, (start, data) in enumerate(self._stretches(epoch)):
+            scores = panel_scores(data, self.profile, self.pairs)
+            if scores is not None:
+                total += np.roll(scores, start % self.profile.tick_bytes)
+            best, sure = best_of(total, self.profile)
+            if sure and seen >= 2:
+                break
+        return best if sure else None

@@ -13,6 +13,7 @@ from typing import Any
 from spikerig.dataset.errors import RigError, UsageError
 from spikerig.dataset.segments import PAGE
 from spikerig.dataset.wire import WireProfile
+from spikerig.rigctl.panel_view import PanelPlan
 from spikerig.rigctl.profiles import DEFAULT, profile_named, profile_of
 from spikerig.rigctl.recorder import OnFull, RecorderOptions
 from spikerig.rigctl.sim.limits import Faults, limits, read_record
@@ -130,6 +131,7 @@ class _Top:
     sync: Any = limits({})
     checks: Any = limits({})
     recorder: Any = limits({})
+    panel: Any = limits(None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,6 +163,7 @@ class TakePlan:
     sync: Sync
     checks: Checks
     recorder: Keeping
+    panel: PanelPlan | None = None
 
     def as_json(self) -> dict[str, Any]:
         """The plan, whole, JSON-ready."""
@@ -210,7 +213,11 @@ def read_plan(table: Mapping[str, Any], source: str = "the plan") -> TakePlan:
         top.name, _names(top.viewpoints, faults), top.seconds, top.advance, top.settle_s, top.tries, top.test_every,
         _profile(spike, source, faults), spike, rgb, read_record(Sync, top.sync, "sync", faults), checks,
         read_record(Keeping, top.recorder, "recorder", faults),
+        None if top.panel is None else read_record(PanelPlan, top.panel, "panel", faults),
     )  # fmt: skip
+    panel = plan[-1]
+    if isinstance(panel, PanelPlan) and panel.bits is not None and panel.slow >= panel.bits:
+        faults.add("panel.slow", f"is {panel.slow}, expected below panel.bits, {panel.bits}")
     faults.raise_any()
     return TakePlan(*plan)  # pyright: ignore[reportArgumentType]  # without a profile there was a fault
 

@@ -183,7 +183,7 @@ def test_the_vendors_slot_sees_what_the_counter_hides():
     for _ in range(3):
         library.take(np.zeros(64_000, np.uint8), 1)
     source._link = Hides()
-    told = [source.read(S) for _ in range(8)]
+    told = [source.read(S) for _ in range(60)]
     assert library.pts > kept + 3
     (new,) = [b for b in told if b.lost_why]
     assert (new.lost_why, new.epoch) == ("rate", 1)

@@ -106,7 +106,7 @@ def test_a_silent_loss_is_seen_from_the_time_and_its_place_is_bounded():
     assert abs(new.lost_bytes - 5000) < 200
     assert gaps(blocks) == ([], [5000], [0])
     assert losses(bridge)["drop"] == 5000
-    assert new.suspect_bytes <= 8 * 2_097_152
+    assert new.suspect_bytes <= 0.13 * K20.bytes_s
 
 
 def test_a_late_host_without_memory_in_the_camera_loses_and_knows():
@@ -172,6 +172,16 @@ def test_a_loss_in_the_last_blocks_is_doubted_at_the_end():
     inside, suspect, _ = gaps([*blocks, (last, last.data)], tail=source.doubtful_bytes)
     assert inside == []
     assert len(suspect) == 1
+
+
+def test_a_loss_that_no_block_tells_any_more_is_doubted_at_the_end():
+    host, _, _, source = opened(faults=[{"kind": "drop", "at_s": 1.0, "bytes": 5000}])
+    blocks = record(host, source, 0.9)
+    while source.epoch == 0:
+        block = source.read(100 * MS)
+        blocks.append((block, block.data.copy()))
+    source.stop()
+    assert gaps(blocks, tail=source.doubtful_bytes) == ([], [5000], [])
 
 
 @pytest.mark.parametrize("seed", range(12))

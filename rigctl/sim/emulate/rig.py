@@ -18,6 +18,7 @@ from spikerig.dataset.wire import WireProfile
 from spikerig.rigctl.gopro import GoProSource
 from spikerig.rigctl.gopro_http import Web
 from spikerig.rigctl.gopro_radio import Radio
+from spikerig.rigctl.panel_view import PanelPlan, centres, mask
 from spikerig.rigctl.record import Rig
 from spikerig.rigctl.sim.emulate.gopro_air import Air
 from spikerig.rigctl.sim.emulate.gopro_camera import Faults as RgbFaults
@@ -26,11 +27,12 @@ from spikerig.rigctl.sim.emulate.gopro_web import AirWifi, WebServer
 from spikerig.rigctl.sim.emulate.harpbox import BoxFaults, HarpBoxWire
 from spikerig.rigctl.sim.emulate.latency import Latency
 from spikerig.rigctl.sim.emulate.oscillator import Oscillator
+from spikerig.rigctl.sim.emulate.panel_light import PanelInView
 from spikerig.rigctl.sim.emulate.serialport import device_errors
 from spikerig.rigctl.sim.emulate.spike_bench import bridge_of
 from spikerig.rigctl.sim.emulate.usb import EmulatedUsb
 from spikerig.rigctl.sim.emulate.virtual import VirtualHost
-from spikerig.rigctl.sim.emulate.world import Ticker, world_of
+from spikerig.rigctl.sim.emulate.world import PanelSeen, Ticker, world_of
 from spikerig.rigctl.sim.limits import Faults, limits, read_record
 from spikerig.rigctl.syncbox import HarpBox
 from spikerig.rigctl.take_plan import TakePlan
@@ -38,6 +40,7 @@ from spikerig.rigctl.vidar import VidarSource
 
 R = TypeVar("R")
 SHIPPED = {"demo": "demo.toml"}
+LED_SPIKES, LED_LIGHT = 0.4, 0.6  # of an LED that is on: spikes a tick, linear light
 CLOCK = ("offset_ns", "ppm", "ramp_ppm_per_min", "walk")
 
 
@@ -109,12 +112,14 @@ def open_emulated(spec: RigSpec, plan: TakePlan, *, card: Path, after_ns: int = 
     wire = plan.profile
     size = (wire.width, wire.height)
     world = world_of(spec.scene, len(plan.viewpoints), size, wire.rate_hz, host, spec.seed or None)
+    box = _box(spec, host) if plan.sync.mode == "box" else None
+    if box is not None and plan.panel is not None:
+        world.panel = _panel(plan.panel, box, size)
     ticker = Ticker(world, spec.seed)
     bridge = bridge_of({"seed": spec.seed, **spec.spike, "profile": _wire_table(wire)}, start_ns, ticker, "spike")
     ticker.tick_ns = bridge.wire.tick_true_ns
     usb = EmulatedUsb(host, [bridge])
     camera = _camera(spec, host, world.frame, card) if plan.rgb.use else None
-    box = _box(spec, host) if plan.sync.mode == "box" else None
     spike = VidarSource(wire, host, usb, serial=plan.spike.serial)
     rgb = None
     if camera is not None:
@@ -186,6 +191,21 @@ def transports_of(spec: RigSpec) -> Transports:
 
 def _nothing(*_: Any) -> Any:
     raise UsageError("an emulated rig without a scene records no pictures")
+
+
+def _panel(plan: PanelPlan, box: HarpBoxWire, size: tuple[int, int]) -> PanelSeen:
+    """The panel in pictures of the world's size: both arms are alike."""
+    width, height = size
+    panel = plan.panel
+    spike, rgb = (
+        PanelInView(panel, centres(panel, corners), radius, light, height, width)
+        for corners, radius, light in (
+            (plan.spike, plan.spike_radius_px, LED_SPIKES), (plan.rgb, plan.rgb_radius_px, LED_LIGHT)
+        )
+    )  # fmt: skip
+    dark = mask(panel, plan.spike, plan.spike_radius_px, height, width)
+    dark |= mask(panel, plan.rgb, plan.rgb_radius_px, height, width)
+    return PanelSeen(spike, rgb, dark, box.box_ns)
 
 
 def _camera(spec: RigSpec, host: VirtualHost, pictures: Any, card: Path) -> GoProCamera:
