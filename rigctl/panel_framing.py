@@ -12,9 +12,9 @@ from spikerig.dataset.panel import Panel
 from spikerig.dataset.wire import WireProfile
 
 WINDOW = 16  # ticks counted together: what blinks is told from what only flickers
-MOST_TICKS = 2048
+MOST_TICKS = 1024
 REACH = 4  # rows: as near as this two offsets see the same LEDs
-FAR, NEAR = 1.5, 1.04  # how much better the best offset must be than any elsewhere, and than its neighbours
+FAR, NEAR = 1.5, 1.08  # how much better the best offset must be than any elsewhere, and than its neighbours
 
 
 def panel_scores(
@@ -33,7 +33,7 @@ def panel_scores(
         Pictures with a black panel at both edges have no seam where top meets bottom, so `framing.find_phase` errs.
 
     Cost:
-        About 1 ms a tick of 12,500 bytes; memory of 4 bytes a pixel and window.
+        A few seconds for 12,500 bytes a tick; memory of 4 bytes a pixel and window.
     """
     size = profile.tick_bytes
     windows = min(len(data) // size, MOST_TICKS) // WINDOW
@@ -43,24 +43,24 @@ def panel_scores(
     for w in range(windows):
         ticks = data[w * WINDOW * size : (w + 1) * WINDOW * size].reshape(WINDOW, size)
         counts[w] = np.unpackbits(ticks, axis=1, bitorder="little").sum(0, dtype=np.uint8)
-    half = max(1, int(min(s.radius_px for pair in pairs for s in pair)))
-    steps = range(-half, half + 1)
-    near = [dy * profile.row_bits + dx for dy in steps for dx in steps]
-    blocks = np.sum([np.roll(counts, -step, axis=1) for step in near], axis=0)
-    blocks -= blocks.mean(0)
+    counts -= counts.mean(0)
     score = np.zeros(size)
     begin = 8 * np.arange(size)
     for one, other in pairs:
-        first, second = (blocks[:, (begin + _wire_pixel(spot, profile)) % (8 * size)] for spot in (one, other))
+        first, second = (
+            np.mean([counts[:, (begin + pixel) % (8 * size)] for pixel in _wire_pixels(spot, profile)], axis=0)
+            for spot in (one, other)
+        )
         score -= (first * second).mean(0)
     return score
 
 
-def _wire_pixel(spot: Spot, profile: WireProfile) -> int:
-    """Number of an LED's middle pixel on the wire, from the tick's first."""
-    row = min(max(int(spot.y_px), 0), profile.height - 1)
-    column = min(max(int(spot.x_px), 0), profile.width - 1)
-    return (profile.height - 1 - row if profile.bottom_up else row) * profile.row_bits + column
+def _wire_pixels(spot: Spot, profile: WireProfile) -> list[int]:
+    """Numbers of an LED's pixels on the wire, from the tick's first."""
+    rows, columns, inside = spot.disk(profile.height, profile.width)
+    y, x = np.nonzero(inside)
+    y, x = y + rows.start, x + columns.start
+    return ((profile.height - 1 - y if profile.bottom_up else y) * profile.row_bits + x).tolist()
 
 
 def complements(panel: Panel, found: Sequence[Spot]) -> list[tuple[Spot, Spot]]:

@@ -116,6 +116,7 @@ def test_a_box_that_boots_begins_an_epoch_and_keeps_its_skew(tmp_path):
     bench = Bench(tmp_path, BoxFaults(resets=(60 * S,)))
     bench.turns(66)
     assert bench.box["epoch"] == 1
+    assert (bench.box["resets"], bench.box["steps"], bench.box["left_out"]) == (1, 0, 0)  # told, not guessed
     assert bench.box["skew_ppm"] == pytest.approx(36, abs=2)
     off, good = bench.off_us()
     assert off <= min(good, 300)

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 from emulated_takes import plan_of, take
 
+from spikerig.calib.panel_read import Spot
 from spikerig.dataset.cli import run
-from spikerig.dataset.errors import DataError, UsageError
+from spikerig.dataset.errors import DataError, RefusedError, UsageError
 from spikerig.dataset.kernels import count
 from spikerig.dataset.rawtake import WireBytes, open_take, read_lines
 from spikerig.dataset.segments import Chunk, scan
 from spikerig.dataset.store import open_scene, verify_scene
 from spikerig.rigctl.ingest import IngestConfig, ingest
+from spikerig.rigctl.ingest_sights import panel_pairs
 from spikerig.rigctl.ingest_times import Framing, Times, clip_number, read_truth
 from spikerig.rigctl.ingest_truth import TrueWorld
 
@@ -174,3 +176,35 @@ def test_names_of_clips() -> None:
     assert clip_number("100GOPRO/GX010078.MP4") == 78
     with pytest.raises(DataError):
         clip_number("../../etc/passwd")
+
+
+WIDE = {"name": "wide", "width": 160, "height": 96, "row_bits": 160, "rate_hz": 20_000, "packet_bytes": 16384}
+EDGES = [6, 5, 154, 5, 6, 91, 154, 91]
+PANEL = {"bits": 12, "slow": 7, "spike": EDGES, "rgb": EDGES, "spike_radius_px": 2.5, "rgb_radius_px": 2.5}
+
+
+def test_the_panel_ties_frames_and_spikes_without_any_truth(tmp_path: Path) -> None:
+    folder = tmp_path / "take"
+    take(folder, plan_of(viewpoints=2, spike={"wire": WIDE}, panel=PANEL))
+    raw = open_take(folder)
+    spans = [s for v in raw.views() for s in v.spikes]
+    wire = WireBytes(raw)
+    assert Framing(wire, spans, panel_pairs(raw)).offset(0) == -first_byte(folder) % raw.profile.tick_bytes
+    with pytest.raises(RefusedError, match="where ticks begin"):
+        Framing(wire, spans, [(Spot(0, 60.0 + x, 30.0, 2.5), Spot(1, 60.0 + x, 60.0, 2.5)) for x in (0, 11)]).offset(0)
+    truth = read_truth(raw)
+    (folder / "truth.json").unlink()
+    told = ingest(folder, tmp_path / "s.h5")
+    assert (told["views"], told["left_out"], told["panel_unread"]) == (2, {}, {})
+    assert told["rgb_times"] == {"sights": 2}
+    assert told["sigma_us"] < 300
+    with open_scene(tmp_path / "s.h5") as file:
+        scene = file.read()
+    times = Times(raw, truth)
+    clips = {v.name: clip_number(v.clips[0]) for v in raw.views()}
+    for view in scene.views:
+        rows = [r for r in truth[0]["rgb"] if r["event"] == "clip" and r["number"] == clips[view.name]]
+        off = times.rig_from_true(truth[0], np.array(rows[0]["true_ns"])) - view.frame.start_ns
+        assert np.abs(off).min() < 300_000
+        assert not view.valid[5, 6]  # an LED
+        assert view.valid[48, 64]

@@ -123,7 +123,7 @@ def test_a_camera_that_stays_away_ends_the_take_in_good_order(tmp_path: Path) ->
 def test_a_full_card_ends_the_take_and_what_was_kept_is_kept(tmp_path: Path) -> None:
     folder = tmp_path / "take"
     with pytest.raises(DeviceError):
-        take(folder, rgb={"faults": {"card_full_s": 1006.0}})
+        take(folder, rgb={"faults": {"card_full_s": 6.0}})
     told = open_take(folder)
     assert told.status == "aborted"
     assert len(told.views()) < 3

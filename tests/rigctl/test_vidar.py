@@ -131,12 +131,12 @@ def test_memory_in_the_camera_bridges_a_late_host():
 class BusyHost(VirtualHost):
     """A host that wakes late: by some hundred microseconds, and now and then by tens of milliseconds."""
 
-    def __init__(self, seed):
+    def __init__(self, seed, share=0.05):
         super().__init__()
-        self.rng = np.random.default_rng(seed)
+        self.rng, self.share = np.random.default_rng(seed), share
 
     def sleep_until(self, at_ns):
-        late = self.rng.exponential(2e5) + (self.rng.random() < 0.05) * self.rng.exponential(2e7)
+        late = self.rng.exponential(2e5) + (self.rng.random() < self.share) * self.rng.exponential(2e7)
         super().sleep_until(at_ns + round(late))
 
 
@@ -147,6 +147,14 @@ def test_a_busy_host_sees_no_loss_where_there_is_none(seed):
     assert "overflow" not in losses(bridge)
     assert epochs(blocks) == []
     assert abs(source.measured_rate().ppm - 30.0) < 5 * max(1, source.measured_rate().sigma_bytes_s / MID.bytes_s * 1e6)
+
+
+def test_a_host_that_is_often_behind_reads_its_backlog_off_and_sees_no_loss():
+    for seed in range(4):
+        host, _, bridge, source = opened(host=BusyHost(seed, 0.3), ram_bytes=32_000_000)
+        blocks = record(host, source, 8.0)
+        assert "overflow" not in losses(bridge)
+        assert epochs(blocks) == []
 
 
 @pytest.mark.parametrize("seed", range(4))
