@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from spikerig.calib.smooth import twist_covariance
+
 COVISIBLE = 4  # mapped views that a further instant is matched against
 
 
@@ -303,10 +305,14 @@ def _place(job: dict[str, Any], root: Path, database: Path, model: Any) -> dict[
         )
         if solved is None or solved["num_inliers"] < 8:
             continue
+        pose = np.asarray(solved["cam_from_world"].matrix())
+        good = np.asarray(solved["inlier_mask"], bool)
+        off = camera.img_from_cam(xyz[good] @ pose[:, :3].T + pose[:, 3]) - xy[good]
+        variance = float(np.sum(off**2)) / max(2 * int(good.sum()) - 6, 1)  # COLMAP's covariance is for one of 1 px^2
         placed[name] = {
-            "pose": np.asarray(solved["cam_from_world"].matrix()).tolist(),
+            "pose": pose.tolist(),
             "inliers": int(solved["num_inliers"]),
-            "cov": np.asarray(solved["covariance"]).tolist(),
+            "cov": (variance * twist_covariance(np.asarray(solved["covariance"]), pose)).tolist(),
         }
     opened.close()
     return placed

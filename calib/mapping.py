@@ -65,8 +65,8 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """A picture placed in a map: cam_from_world float64[3,4], its inliers, covariance of rotation and translation, and
-    the mean residual of its features in pixels."""
+    """A picture placed in a map: cam_from_world float64[3,4], its inliers, covariance [6,6] of the twist it is off by
+    (rotation, translation; on its left), and the mean residual of its features in pixels."""
 
     pose: NDArray[np.float64]
     inliers: int

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.calib.consensus import Path, agree, apart_by, averaged, paths_through
+from spikerig.calib.consensus import Path, agree, apart_by, averaged, paths_through, still_paths
 from spikerig.calib.gauge import centres, extent
 from spikerig.calib.mapping import Map, Options, build_map
 from spikerig.calib.pattern import fixed_pattern
@@ -67,7 +67,7 @@ class Estimate:
     Args:
         images: names of all views asked for.
         poses: cam_from_world [3,4] at mid-exposure, by view, of those placed.
-        paths: over the exposure, by view, of those where enough instants were.
+        paths: over the exposure, by view; one without chi-square was not measured and stands still.
         best: the map they come from.
         kinds: of texture mapped; the first is `best`'s.
         looked: sharpness and noise of the kinds.
@@ -326,9 +326,11 @@ def _settled(rigged: _Rigged, maps: Mapping[str, Map], names: tuple[str, ...], r
     group = friends[best]
     poses = averaged([maps[k] for k in group])
     pairs = [apart[best, k] for k in group[1:]]
-    first = maps[order[0]]
-    through = rigged.wanted.instants > 1 and order[0] in group  # the first map holds the further instants
-    paths = paths_through(first, maps[best], poses, rigged.phases) if through else {}
+    paths: dict[str, Path] = {}
+    if rigged.wanted.instants > 1:
+        first = maps[order[0]] if order[0] in group else _with_instants(rigged, best)
+        paths = paths_through(first, maps[best], poses, rigged.phases)
+        paths |= still_paths(paths, poses, rigged.phases)
     kinds = (best, *(k for k in order if k != best))
     seconds: dict[str, float] = {}
     for found in maps.values():
@@ -348,6 +350,13 @@ def _settled(rigged: _Rigged, maps: Mapping[str, Map], names: tuple[str, ...], r
         seconds,
         None if rigged.gain is None else float(np.std(np.log(rigged.gain))),
     )
+
+
+def _with_instants(rigged: _Rigged, name: str) -> Map:
+    """The map of that name once more, with the further instants: the map that had them is not to be trusted."""
+    kind, _, low = name.partition(", ")
+    again = replace(rigged, options=replace(rigged.options, **HARDER)) if low else rigged
+    return again.map(kind, first=True)
 
 
 def _judged(found: Estimate, wanted: Wanted) -> Estimate:
