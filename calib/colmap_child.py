@@ -62,6 +62,7 @@ def main(path: str) -> None:
         if job["camera"] or job.get("rig"):
             _adjust(best)
         told |= _model(best, root)
+        told["link"] = _weakest_link(best, bool(job.get("rig")))
         best.write_text(str(sparse))
         lap("adjusting")
         if job["place"]:
@@ -316,6 +317,43 @@ def _place(job: dict[str, Any], root: Path, database: Path, model: Any) -> dict[
         }
     opened.close()
     return placed
+
+
+def _weakest_link(model: Any, rigged: bool) -> dict[str, Any]:
+    """How few points hold two parts of a map together, and which views are the smaller part.
+
+    The views are joined by the strongest links (points that both see, and a third view too: two views alone say nothing
+    of their distance against the others'; the arms of a rig are one view); the weakest link that is needed is the one along which a map bends.
+    """
+    view = {i.name: Path(i.name).name if rigged else i.name for i in model.images.values() if i.has_pose}
+    seen: dict[str, set[int]] = {name: set() for name in view.values()}
+    for key, point in model.points3D.items():
+        names = {view[name] for e in point.track.elements if (name := model.images[e.image_id].name) in view}
+        if len(names) > 2:
+            for name in names:
+                seen[name].add(key)
+    found = weakest_link(seen)
+    return found | {"views": [min(n for n, v in view.items() if v == name) for name in found["views"]]}
+
+
+def weakest_link(seen: dict[str, set[int]]) -> dict[str, Any]:
+    """The weakest edge of the strongest tree over views that see points: {"points", "views" of the smaller part}."""
+    names = sorted(seen)
+    best = {n: (len(seen[n] & seen[names[0]]), names[0]) for n in names[1:]}
+    edges: list[tuple[int, str, str]] = []
+    while best:
+        name = max(best, key=lambda n: (best[n][0], n))
+        count, other = best.pop(name)
+        edges.append((count, name, other))
+        for n in best:
+            best[n] = max(best[n], (len(seen[n] & seen[name]), name))
+    if not edges:
+        return {"points": 0, "views": names}
+    weak = min(edges)
+    part = {weak[1]}
+    while more := {n for _, a, b in edges if (a, b) != weak[1:] for n in (a, b) if {a, b} & part} - part:
+        part |= more
+    return {"points": weak[0], "views": sorted(min(part, set(names) - part, key=len))}
 
 
 def _neighbours(model: Any, mapped: dict[str, Any]) -> dict[str, list[str]]:

@@ -238,6 +238,7 @@ def report(estimate: Any, options: Any) -> dict[str, Any]:
         "error_px": None if best.error_px != best.error_px else best.error_px,
         "points": len(best.xyz),
         "free_focal": dict(best.focal) or None,
+        "weakest_link": None if best.link is None else {"points": best.link, "views": list(best.hanging)},
         "kinds": list(estimate.kinds),
         "textures": [
             {"kind": k.kind, "sharpness": k.sharpness, "noise": k.noise, "refound": k.refound, "spread_px": k.spread}

@@ -21,8 +21,8 @@ def smooth_path(
 
     The path is exp(x(t)) B, where B is the measured pose nearest to the middle, exp that of SE(3), and x(t) a twist
     whose six components are cubics in time: a spline of one span in the tangent space at B. It is fitted to the
-    logarithms log(P B^-1) of the measured poses P by robust least squares, weighted by their whole covariances. All of it is
-    well-defined, and the fit of a path that lies on such a curve exact, for turns of less than half a turn about B.
+    logarithms log(P B^-1) of the measured poses P by robust least squares, weighted by their whole covariances. All of
+    it is well-defined, and the fit of a path that lies on such a curve exact, for less than half a turn away from B.
 
     Args:
         at: phases of the measured poses, float64[N], 0 to 1.
@@ -48,7 +48,8 @@ def smooth_path(
     local = np.array([log_se3(compose(pose, inverse(base))) for pose in poses])
     degree = max(0, min(degree, len(at) - 2 if len(at) > 2 else len(at) - 1))
     basis, ask = (np.polynomial.legendre.legvander(2 * np.asarray(p) - 1, degree) for p in (at, wanted))
-    white = np.array([_whitening(c) for c in cov])
+    back = [np.linalg.inv(left_jacobian(x)) for x in local]  # from motions on a pose's left to changes of its twist
+    white = np.array([_whitening(J @ c @ J.T) for J, c in zip(back, cov, strict=True)])
     system = np.einsum("nij,nd->nidj", white, basis).reshape(6 * len(at), -1)
     sides = np.einsum("nij,nj->ni", white, local).ravel()
     weight, off, solved = np.ones(6 * len(at)), np.zeros(6 * len(at)), np.zeros(system.shape[1])
