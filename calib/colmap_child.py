@@ -322,8 +322,9 @@ def _place(job: dict[str, Any], root: Path, database: Path, model: Any) -> dict[
 def _weakest_link(model: Any, rigged: bool) -> dict[str, Any]:
     """How few points hold two parts of a map together, and which views are the smaller part.
 
-    The views are joined by the strongest links (points that both see, and a third view too: two views alone say nothing
-    of their distance against the others'; the arms of a rig are one view); the weakest link that is needed is the one along which a map bends.
+    The views (the arms of a rig are one view) are joined by the strongest links: points that both see, and a third view
+    too, for two views alone say nothing of their distance against the others'. The weakest link that is needed is the
+    one along which a map bends.
     """
     view = {i.name: Path(i.name).name if rigged else i.name for i in model.images.values() if i.has_pose}
     seen: dict[str, set[int]] = {name: set() for name in view.values()}
