@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 # A free focal length that is off by the first, and takes the second of the residual with it, says that K is wrong.
 WRONG_FOCAL = ((0.05, 0.02), (0.2, 0.003))
-# Points that the weakest link of a map needs, and below which all maps must agree: bent maps have up to 39, right ones
+# Points that the weakest link of a map needs, and below which all maps must agree: bent maps have up to 51, right ones
 # 39 and more (demo and leaves over 174 degrees, 7 to 28 views; see docs/poses.md).
 WEAK_LINK, THIN_LINK = 35, 60
 
