@@ -13,12 +13,12 @@ import torch
 from numpy.typing import NDArray
 
 from spikerig.dataset.errors import DataError, UsageError
+from spikerig.dataset.rigid import between, compose, exp_se3, inverse
 from spikerig.dataset.scene import Floats
 from spikerig.dataset.terminal import progress
 from spikerig.train.layout import FILE, Layout, frame_row, is_layout, label_of, read_layout, write_layout
 from spikerig.train.model import Model
 from spikerig.train.start import SH0
-from spikerig.train.trajectory import between, compose, exp_se3, inverse
 
 if TYPE_CHECKING:
     from spikerig.dataset.store import SceneFile
