@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.scene import Floats
 from spikerig.train import metrics
+from spikerig.train.field import Model
 from spikerig.train.metrics import SSIM_VARIANTS, rounded
-from spikerig.train.model import BACKGROUNDS, Model
+from spikerig.train.model import BACKGROUNDS
 from spikerig.train.targets import truth_pose
 
 if TYPE_CHECKING:
