@@ -248,8 +248,8 @@ def paper() -> FitConfig:
 
 
 PRESETS: dict[str, Callable[[], FitConfig]] = {"draft": draft, "standard": standard, "full": full, "paper": paper}
-FIELDS: dict[str, tuple[Callable[[FitConfig], FitConfig], Collection[str]]] = {
-    "splat": (lambda config: config, ("draft", "standard", "full")),
+FIELDS: dict[str, tuple[Callable[[str], dict[str, Any]], Collection[str]]] = {  # settings by preset, presets
+    "splat": (lambda preset: {}, ("draft", "standard", "full")),
     "nerf": (nerf, NERF),
     "nerf-fast": (nerf_fast, FAST),
 }
@@ -335,7 +335,7 @@ def configure(method: str = "plain", preset: str = "standard", field: str = "spl
         raise UsageError(
             f"field {field} has no use for these settings", value=", ".join(strange), next="leave them out"
         )
-    return replace(shape(METHODS[method](PRESETS[preset]())), **changes)
+    return replace(METHODS[method](PRESETS[preset]()), **(shape(preset) | changes))
 
 
 def parse_setting(text: str) -> tuple[str, Any]:

@@ -104,14 +104,3 @@ class Field(Protocol):
     def torch_threads(self) -> int:
         """How many torch may use; with more than one, bits hold only at that number."""
         ...
-
-
-def field_of(config: FitConfig) -> Field:
-    """The field a config names."""
-    if config.field == "splat":
-        from spikerig.train.splatfield import SplatField
-
-        return SplatField()
-    from spikerig.train.rayfield import RayField
-
-    return RayField(config.field)

@@ -24,7 +24,8 @@ from spikerig.dataset.scene import Camera
 from spikerig.train import checkpoint
 from spikerig.train.adam import update
 from spikerig.train.config import FitConfig, effective_weight
-from spikerig.train.field import Field, Model, Step, Tensors, field_of
+from spikerig.train.field import Field, Model, Step, Tensors
+from spikerig.train.fields import field_of
 from spikerig.train.gauge import Gauge
 from spikerig.train.losses import average_exposure, l2_loss, light_of, mean_weights, tfs_loss
 from spikerig.train.model import BACKGROUNDS

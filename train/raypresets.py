@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from spikerig.train.config import FitConfig
+from typing import Any
 
 RAYS: dict[str, Any] = {"colour_loss": "l2", "fresh_poses": 0, "densify": "off", "opacity_reg": 0.0, "scale_reg": 0.0}
 
@@ -17,25 +13,25 @@ NERF: dict[str, dict[str, Any]] = {
     "paper": {"steps": 200_000},
 }
 FAST: dict[str, dict[str, Any]] = {
-    "draft": {"steps": 3000, "fine": 32, "table_log2": 15, "finest": 256},
+    "draft": {"steps": 3000, "fine": 32, "table_log2": 16, "finest": 256},
     "standard": {"steps": 10_000, "fine": 48, "table_log2": 17, "finest": 512},
     "full": {"steps": 30_000, "fine": 64, "table_log2": 19, "finest": 1024, "grid_levels": 16},
 }
 
 
-def nerf(config: FitConfig) -> FitConfig:
+def nerf(preset: str) -> dict[str, Any]:
     """The paper's field: 8 x 256 coarse and fine networks, 64 + 128 samples, 1024 rays of one view a step.
 
     Smaller at `draft` and `standard`; Adam from 5e-4 down to a tenth.
     """
     shape = {"rays": 1024, "coarse": 64, "fine": 128, "width": 256, "lr_net": 5e-4, "lr_end": 0.1}
-    return replace(config, field="nerf", **RAYS, **(shape | NERF[config.preset]))
+    return RAYS | {"field": "nerf"} | shape | NERF[preset]
 
 
-def nerf_fast(config: FitConfig) -> FitConfig:
+def nerf_fast(preset: str) -> dict[str, Any]:
     """Hash grid, occupancy grid and small networks: 1024 rays of 8 views a step."""
     shape = {
-        "rays": 1024, "views_per_step": 8, "coarse": 96, "width": 32, "grid_levels": 12,
-        "lr_net": 3e-3, "lr_grid": 1e-2, "lr_end": 0.05,
+        "rays": 1024, "views_per_step": 8, "coarse": 96, "width": 64, "grid_levels": 12,
+        "lr_net": 5e-3, "lr_grid": 2e-2, "lr_end": 0.05,
     }  # fmt: skip
-    return replace(config, field="nerf-fast", **RAYS, **(shape | FAST[config.preset]))
+    return RAYS | {"field": "nerf-fast"} | shape | FAST[preset]

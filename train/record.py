@@ -17,7 +17,8 @@ from spikerig.dataset.scene import Camera
 from spikerig.dataset.terminal import jsonable
 from spikerig.train import checkpoint
 from spikerig.train.config import FitConfig, from_json
-from spikerig.train.field import Model, field_of
+from spikerig.train.field import Model
+from spikerig.train.fields import field_of
 from spikerig.train.gauge import Gauge
 
 CHECKPOINT, RECORD, HISTORY = "checkpoint.safetensors", "run.json", "history.json"

@@ -14,7 +14,7 @@ from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.terminal import Progress, note
 from spikerig.train import record as records
 from spikerig.train.config import FitConfig
-from spikerig.train.field import field_of
+from spikerig.train.fields import field_of
 from spikerig.train.fit import State, Task, check_finite, load_state, new_state, save_state, torch_threads, train
 from spikerig.train.gauge import gauge_of
 from spikerig.train.model import SplatModel, check_pinhole

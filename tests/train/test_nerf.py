@@ -1,6 +1,7 @@
 """The fields of rays inside a fit: every method, resume, threads, what is refused, what is drawn."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -145,10 +146,98 @@ def test_a_number_that_is_none_is_told_with_step_tensor_and_index(tiny, field):
 
 
 def test_the_torch_threads_of_a_fit(threads):
-    from spikerig.train.field import field_of
+    from spikerig.train.fields import field_of
 
     threads(3)
     assert _native.threads() == 3
     assert field_of(small("nerf")).torch_threads() == 3
     assert field_of(small("nerf-fast")).torch_threads() == 1
     assert field_of(configure()).torch_threads() == 1
+
+
+def changed(tiny, config, change):
+    """(task, state) of a fit whose targets were changed view by view."""
+    with open_scene(tiny) as scene:
+        task, _ = prepare(scene, tiny, config)
+        points = scene.points
+    targets = replace(task.targets, views=tuple(change(view) for view in task.targets.views))
+    task = replace(task, targets=targets)
+    return task, new_state(points, task)
+
+
+def test_a_black_scene_goes_black(tiny):
+    config = small("nerf-fast", steps=120, lr_net=2e-2)
+    task, state = changed(tiny, config, lambda view: replace(view, frame=torch.zeros_like(view.frame)))
+    train(state, task)
+    with open_scene(tiny) as scene:
+        picture = task.model(state).picture(scene.view(scene.test[0], spikes=False).pose.cam_from_world)
+    assert np.isfinite(picture).all()
+    assert picture.mean() < 0.05
+
+
+@pytest.mark.parametrize("field", SMALL)
+def test_one_view_trains(tiny, field):
+    config = small(field, "spikenerf", steps=3)
+    with open_scene(tiny) as scene:
+        task, _ = prepare(scene, tiny, config)
+        points = scene.points
+    task = replace(task, targets=replace(task.targets, views=task.targets.views[:1]))
+    state = new_state(points, task)
+    losses = []
+    train(state, task, after=lambda state, fraction, loss: losses.append(loss))
+    assert np.isfinite(losses).all()
+    assert len(losses) == 3
+
+
+def test_a_target_that_is_no_number_is_told(tiny):
+    task, state = changed(tiny, small("nerf-fast"), lambda view: replace(view, frame=view.frame * float("nan")))
+    with pytest.raises(NumericsError, match="step 0"):
+        one_step(state, task, 0.0)
+
+
+def test_pixels_outside_the_valid_part_do_not_count(tiny):
+    def masked(view):
+        valid = torch.zeros(view.frame.shape[:2], dtype=torch.bool)
+        valid[10:20] = True
+        return replace(view, frame=torch.where(valid[..., None], view.frame, torch.nan), valid=valid)
+
+    task, state = changed(tiny, small("nerf-fast", steps=3), masked)
+    train(state, task)
+    assert all(torch.isfinite(p).all() for p in state.params.values())
+
+
+def test_a_batch_holds_the_views_own_pixels(tiny):
+    """Each row of a batch is the pixel of the view it came from, with that view's pose and textures."""
+    from spikerig.train.fields import field_of
+
+    config = small("nerf-fast", "spikenerf-5x", rays=64)
+    with open_scene(tiny) as scene:
+        task, _ = prepare(scene, tiny, config)
+    batch = field_of(config).look(task.targets, task.camera, config, 3, np.random.default_rng(0))
+    views = {view.name: view for view in task.targets.views}
+    names = batch.name.split(", ")
+    assert len(names) == 6  # eight wanted, six there: two of them twice
+    assert batch.pixels is not None
+    for row, pixel in enumerate(batch.pixels.tolist()):
+        y, x = divmod(pixel, task.camera.width)
+        owners = [v for v in views.values() if all(
+            torch.equal(batch.instants[p].pose[row], v.instants[p].pose) for p in batch.instants)]  # fmt: skip
+        (owner,) = owners
+        assert torch.equal(batch.frame[row, 0], owner.frame[y, x])
+        for phase, instant in batch.instants.items():
+            for (light, _), (whole, _) in zip(instant.textures, owner.instants[phase].textures, strict=True):
+                assert light[row, 0] == whole[y, x]
+
+
+def test_all_fields_are_timed_side_by_side(tiny, monkeypatch):
+    from spikerig.train import config, fieldcost
+
+    def tiny_field(method, preset, name, seed):
+        return small(name, method, seed=seed) if name != "splat" else config.FitConfig(preset="draft", splats=50)
+
+    monkeypatch.setattr(config, "configure", tiny_field)
+    rows = fieldcost.field_cost(tiny, method="plain", preset="draft", rounds=1)
+    assert [row["field"] for row in rows] == ["splat", "nerf-fast", "nerf"]
+    assert [row["timed_steps"] for row in rows] == [30, 30, 1]
+    assert rows[-1]["times_nerf"] == 1
+    assert all(row["cpu_seconds"] > 0 for row in rows)
