@@ -100,12 +100,24 @@ def _correlation(a: Floats, b: Floats, where: NDArray[np.bool_]) -> float:
 def _peak(a: Floats, b: Floats, where: NDArray[np.bool_]) -> tuple[Floats, float]:
     """The shift of b against a at which their edges agree best, to a fraction of a pixel, and how well."""
     steps = range(-REACH, REACH + 1)
-    scores = np.array([[_correlation(a, np.roll(b, (-y, -x), (0, 1)), where) for x in steps] for y in steps])
+    near = _around(where)
+    one, other, here = a[near], b[near], where[near]
+    scores = np.array([[_correlation(one, np.roll(other, (-y, -x), (0, 1)), here) for x in steps] for y in steps])
     y, x = np.unravel_index(int(scores.argmax()), scores.shape)
     best = float(scores[y, x])
     if best < FAINT:
         return np.full(2, np.nan), best
     return _nudged(a, b, where, np.array([x - REACH, y - REACH], np.float64)), best
+
+
+def _around(where: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """The rectangle of some pixels and all within REACH of them."""
+    spans = []
+    for axis in (1, 0):
+        at = np.flatnonzero(where.any(axis))
+        first, last = (int(at[0]), int(at[-1])) if at.size else (0, 0)
+        spans.append(slice(max(first - REACH, 0), last + REACH + 1))
+    return spans[0], spans[1]
 
 
 def _nudged(a: Floats, b: Floats, where: NDArray[np.bool_], shift: Floats) -> Floats:

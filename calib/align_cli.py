@@ -169,8 +169,8 @@ def _say(told: dict[str, Any], checked: Checked, record: RigCalibration) -> None
     if record.model == "stereo":
         note("note: a stereo rig is aligned at one depth only; elsewhere edges lie apart")
     if not checked.warp.same:
-        note("note: spikes stay raw, on a lens that distorts or mirrors: textures made of them must be warped too "
-             "(calib.align.warp_texture)")  # fmt: skip
+        note("note: spikes stay raw, on a lens that distorts or mirrors: `train` and `calib poses` straighten them; "
+             "in code of your own, calib.straight does")  # fmt: skip
     for text in told["reasons"]:
         note(f"refused: {text}: calibrate again, or try --refine; was the rig touched since?")
     if told["written"]:

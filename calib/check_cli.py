@@ -162,12 +162,29 @@ at all, or breaks the rules of [formats](format.md).
 
 {profiles}
 
-Memory is bounded by one view (its spikes are summed up 8 MB at a time; the checks of light hold those around its
-exposure). `--only file-is-whole` is the slowest for a large file: it reads every byte, in a process of its own.
+Memory is bounded by one view: spikes are summed up 8 MB at a time, and the checks of light hold those around one
+exposure. The demo's scene at 400x250, 50 views, 517 MB: 19 CPU seconds and 193 MB at most, nearly all of it in
+`edges-lie-together` and `frames-are-in-step` (`spikerig data check demo400.h5`, of `spikerig sim capture
+docs/demo400.toml --views 50`; 2 cores of an AMD EPYC, AVX-512, commit 6dee168).
+
+`frames-are-in-step` measures: it makes the exposure's blur of the spikes at 13 lags and asks which fits the picture
+best. In that scene it finds 0.01 ticks, with a standard deviation of 0.03, where the truth is 0. A shift of all
+pictures against the spikes is fitted beside the lag, so that a misaligned rig does not look late where views move in
+different ways. The standard deviation is that of leaving out each view in turn.
 
 {table}
 The document of `--json` has `checks` (each with `status`, `seconds`, and by view why it was undecided) and `findings`
 (`check`, `importance`, `where`, `message`, `fix`).
+
+## Looking at it
+
+    spikerig data sheet SCENE.h5 -o sheet.html
+    spikerig calib poses SCENE.h5 --write --sheet sheet.html
+
+One page without scripts or anything outside it: of every view the picture, TFP and TFI at mid-exposure, and both arms
+laid over each other; the cameras from above and from the side with their paths over the exposures; edges of both arms,
+reprojection errors and observations of each view. Pictures are made smaller until the page fits `--limit-mb` (9). The
+scene above: 7.8 MB, 22 CPU seconds, 140 MB of memory.
 """
 
 

@@ -12,7 +12,7 @@ from spikerig.calib.clock_hull import ASSUMED_NS, hull_floor
 from spikerig.calib.clock_maps import ClockFit, Clocks, as_fit, compose, invert, joined, shifted
 from spikerig.calib.clock_probe import Gated, gate, reweighed
 from spikerig.calib.clock_resets import once, parts
-from spikerig.calib.clock_sight import named, sight_pairs
+from spikerig.calib.clock_sight import ALLOWED_NS, named, sight_pairs
 from spikerig.calib.clock_track import Pairs, Track, Wander, track
 from spikerig.dataset.clocktime import ClockModel
 from spikerig.dataset.errors import DataError
@@ -105,7 +105,9 @@ def _two_way(epoch: int, probes: Sequence[Probe], options: Options) -> list[Piec
 
 
 def _sights(clock: str, epoch: int, sights: Sequence[Sight], options: Options) -> list[Piece]:
-    return _pieces(clock, epoch, "sights", "box", sight_pairs(sights), options, LEAST_NS["sights"], 0.0, True)
+    return _pieces(
+        clock, epoch, "sights", "box", sight_pairs(sights), options, LEAST_NS["sights"], ALLOWED_NS[clock], False
+    )
 
 
 def _one_way(clock: str, epoch: int, probes: Sequence[Probe], options: Options) -> list[Piece]:
@@ -128,12 +130,14 @@ def _pieces(
             notes.append(f"a step of {part.step_ns / 1e3:+.0f} us at its start that nobody told of")
         if burst.any():
             notes.append(f"{int(burst.sum())} marks contradict those before and after them: left out")
-        if not proved:
+        if how == "one-way" and not proved:
             notes.append(f"the latency's floor is unknown: assumed below {bias_ns / 1e3:.0f} us")
         own = pairs.take(part.number)
         done = track(own, options.wander)
         if how == "two-way":
             done = track(reweighed(own, done), options.wander)
+        if done.scale > 3:
+            notes.append(f"marks scatter {done.scale:.0f} times as much as they claim: what they claim was widened")
         told.append(Piece(clock, epoch, how, to, done, bias_ns, proved, tuple(notes)))
     return told
 

@@ -39,14 +39,20 @@ class Follower:
 
         Marks come in the order of x; one that lies before the last is taken at the last's time.
         """
-        if not self.marks:
-            self._begin(x_ns, y_ns, sd_ns)
+        if self.marks <= 0:
+            fresh = self.marks == 0
+            self._begin(x_ns, y_ns, sd_ns, None if fresh else (self.state[1:].copy(), self.cov[1:, 1:].copy()))
             return "used"
         told_ns, sigma = self.predict(x_ns)
         off = float(y_ns - told_ns)
-        if abs(off) > max(self.least_ns, FAR * float(np.hypot(sigma, sd_ns))):
+        limit = max(self.least_ns, FAR * float(np.hypot(sigma, sd_ns)))
+        if abs(off) > limit:
             self.far.append((x_ns, y_ns, sd_ns))
             return self._judged()
+        if self.far:
+            x, y, _ = self.far[-1]
+            if abs(off - (y - self.predict(x)[0])) <= limit:
+                return "far"  # too poor to tell the old course from the new one
         self.far.clear()
         self._update(x_ns, off, sd_ns)
         return "used"
@@ -56,6 +62,22 @@ class Follower:
         state, cov = self._at(x_ns)
         ahead = float(state[0])
         return self.origin[1] + (int(x_ns) - self.origin[0]) + round(ahead), float(np.sqrt(cov[0, 0]))
+
+    def again(self) -> None:
+        """The clock began anew: the next mark sets the offset; the crystal, and so the skew, stays."""
+        if self.marks:
+            self.marks = -1
+            self.far.clear()
+
+    def stood(self, by_ns: int, sd_ns: float) -> None:
+        """x stood still while y went on for `by_ns`, known to `sd_ns`: the crystals had that time to wander."""
+        if self.marks <= 0:
+            return
+        step, noise = transition(by_ns / NS, self.wander)
+        self.state, self.cov = step @ self.state, step @ self.cov @ step.T + noise
+        self.state[0] += by_ns
+        self.cov[0, 0] += sd_ns**2
+        self.far.clear()
 
     @property
     def skew_ppm(self) -> float:
@@ -67,10 +89,12 @@ class Follower:
         """Its standard deviation."""
         return float(np.sqrt(self.cov[1, 1])) * 1e-3
 
-    def _begin(self, x_ns: int, y_ns: int, sd_ns: float) -> None:
+    def _begin(self, x_ns: int, y_ns: int, sd_ns: float, crystal: tuple[Floats, Floats] | None = None) -> None:
         self.origin, self.last_ns, self.marks = (int(x_ns), int(y_ns)), int(x_ns), 1
         self.state = np.zeros(3)
         self.cov = np.diag([sd_ns, self.wander.ppm * 1e3, self.wander.drift * NS]) ** 2
+        if crystal is not None:
+            self.state[1:], self.cov[1:, 1:] = crystal
         self.far.clear()
 
     def _at(self, x_ns: int) -> tuple[Floats, Floats]:
@@ -96,7 +120,6 @@ class Follower:
             return "far"
         self.stepped_ns = float(np.median(offs))
         x, y, _ = recent[-1]
-        skew, spread = self.state[1:].copy(), self.cov[1:, 1:].copy()
-        self._begin(x, y, sd)
-        self.state[1:], self.cov[1:, 1:] = skew, spread  # a step of the count leaves the crystal as it was
+        # A step of the count leaves the crystal as it was.
+        self._begin(x, y, sd, (self.state[1:].copy(), self.cov[1:, 1:].copy()))
         return "step"

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spikerig.calib.clock_track import Floats, Int64, Pairs
 from spikerig.dataset.clocktime import NS
@@ -79,11 +80,22 @@ def hull_floor(probes: Sequence[Probe], assumed_ns: float = ASSUMED_NS) -> Floor
         above = late[inside] - np.interp(at_s[inside], at_s[corner], late[corner])
         # Of n exponential delays with mean m, the hull's corners lie about m * corners / n above the floor.
         tail = float(above.mean()) * max(len(corner), 2) / max(len(inside) - len(corner), 1)
+        corner = corner[_inner(at_s[corner], late[corner], tail)]
         chosen.append(corner)
         sd.append(np.full(len(corner), max(tail, 1000.0)))
     number = np.concatenate(chosen)
     bias, proved = _bound(probes, at_s, late, start, assumed_ns)
     return Floor(Pairs.plain(device[number], host[number], np.concatenate(sd)), bias, proved, number)
+
+
+def _inner(x: Floats, y: Floats, tail: float) -> NDArray[np.bool_]:
+    """Corners of a hull that lie near its middle edge's line: those at the ends are only the first and last stamps."""
+    if len(x) < 2:
+        return np.ones(len(x), bool)
+    k = min(int(np.searchsorted(x, (x[0] + x[-1]) / 2, side="right")), len(x) - 1)
+    a, b = k - 1, k
+    line = y[a] + (x - x[a]) * ((y[b] - y[a]) / (x[b] - x[a]))
+    return y - line <= max(5 * tail, 5000.0)
 
 
 def _bound(

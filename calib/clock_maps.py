@@ -26,7 +26,8 @@ class ClockFit:
         model: rig time from the clock's; sigma holds noise, wander and the bias bound. Twice it is what the map is
             good to in at least 95 % of cases.
         valid_ns: first and last mark, the clock's time; outside, the model holds over.
-        bias_ns: bound on what no residual shows: half the delay of probes, the floor latency of one-way stamps.
+        bias_ns: bound on what no residual shows: half the delay of probes, the floor latency of one-way stamps, an
+            allowance for the reading of a panel.
         proved: the bound follows from the marks; else it is assumed.
         skew_ppm, skew_sd_ppm: of rig time against the clock at the last mark.
         residual_ns: rms of the marks used; it is not the accuracy.

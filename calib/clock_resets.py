@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.calib.clock_follow import CONFIRM, Follower
-from spikerig.calib.clock_track import Int64, Pairs, Wander
+from spikerig.calib.clock_track import Int64, Pairs, Wander, middle_line
 from spikerig.dataset.clocktime import NS
 from spikerig.dataset.errors import UsageError
 
@@ -74,7 +74,7 @@ def parts(pairs: Pairs, wander: Wander | None = None, least_ns: float = 50_000.0
     cells = _cells(pairs)
     if not cells:
         return [], burst
-    pairs = _without_constants(pairs, cells)
+    pairs = _without_constants(pairs)
     found: list[tuple[list[int], float]] = [([], 0.0)]
     follower = Follower(wander or Wander(), least_ns)
     follower.add(*_beginning(pairs, cells, least_ns))
@@ -86,7 +86,7 @@ def parts(pairs: Pairs, wander: Wander | None = None, least_ns: float = 50_000.0
             found[-1][0].append(k)
         elif verdict == "step":
             first = k - CONFIRM + 1
-            back = _returns(pairs, cells, k, before)
+            back = _returns(pairs, cells, k, before, follower)
             if back:
                 follower, k = before, back
                 follower.far.clear()
@@ -110,30 +110,33 @@ def _cells(pairs: Pairs) -> list[Int64]:
     return np.split(order, np.flatnonzero(np.diff(number)) + 1)
 
 
-def _without_constants(pairs: Pairs, cells: list[Int64]) -> Pairs:
-    """Pairs whose constants are fitted to what differs within cells, and taken off."""
+def _without_constants(pairs: Pairs) -> Pairs:
+    """Pairs whose constants are fitted to what differs among neighbours, and taken off."""
     if not pairs.extra.shape[1]:
         return pairs
+    order = np.argsort(pairs.x_ns, kind="stable")
+    at_s = (pairs.x_ns - pairs.x_ns[order[0]]).astype(np.float64) / NS
     ahead = ((pairs.y_ns - pairs.y_ns[0]) - (pairs.x_ns - pairs.x_ns[0])).astype(np.float64)
-    rows, rest = pairs.extra.copy(), ahead.copy()
-    for which in cells:
+    line, _ = middle_line(at_s, ahead, pairs.sd_ns)
+    rows, rest = pairs.extra.copy(), ahead - line[1] * at_s
+    for which in np.array_split(order, max(len(order) // max(12, len(order) // 500), 1)):
         rows[which] -= rows[which].mean(0)
-        rest[which] -= np.median(ahead[which])
-    use = np.ones(len(rest), bool)
+        rest[which] -= np.median(rest[which])
     found = np.zeros(rows.shape[1])
-    for _ in range(3):
-        weight = np.diag(1 / pairs.prior**2) * float(np.median(pairs.sd_ns)) ** 2
-        found = np.linalg.solve(rows[use].T @ rows[use] + weight, rows[use].T @ rest[use])
+    weight = np.diag(1 / pairs.prior**2) * float(np.median(pairs.sd_ns)) ** 2
+    for _ in range(4):
         off = np.abs(rest - rows @ found)
         use = off <= 4 * max(1.4826 * float(np.median(off)), 1.0)
+        found = np.linalg.solve(rows[use].T @ rows[use] + weight, rows[use].T @ rest[use])
     return replace(pairs, y_ns=pairs.y_ns - np.rint(pairs.extra @ found).astype(np.int64))
 
 
 def _middle(pairs: Pairs, which: Int64) -> tuple[int, int, float]:
-    """A cell as one mark: the pair with the middle offset, and the deviation of a median."""
-    ahead = pairs.y_ns[which] - pairs.x_ns[which]
-    at = which[np.argsort(ahead, kind="stable")[(len(which) - 1) // 2]]
-    sd = float(np.median(pairs.sd_ns[which])) * 1.25 / np.sqrt(len(which))
+    """A cell as one mark: of its best pairs the one with the middle offset, and the deviation of a median."""
+    best = which[pairs.sd_ns[which] <= 1.5 * pairs.sd_ns[which].min()]
+    ahead = pairs.y_ns[best] - pairs.x_ns[best]
+    at = best[np.argsort(ahead, kind="stable")[(len(best) - 1) // 2]]
+    sd = float(np.median(pairs.sd_ns[best])) * 1.25 / np.sqrt(len(best))
     return int(pairs.x_ns[at]), int(pairs.y_ns[at]), max(sd, 500.0)
 
 
@@ -147,7 +150,7 @@ def _beginning(pairs: Pairs, cells: list[Int64], least_ns: float) -> tuple[int, 
     return heads[0]
 
 
-def _returns(pairs: Pairs, cells: list[Int64], k: int, before: Follower) -> int:
+def _returns(pairs: Pairs, cells: list[Int64], k: int, before: Follower, after: Follower) -> int:
     """The first of several cells in a row, within a minute, that go on as before; 0 where there is none."""
     run = 0
     for c in range(k + 1, len(cells)):
@@ -155,7 +158,8 @@ def _returns(pairs: Pairs, cells: list[Int64], k: int, before: Follower) -> int:
         if x - before.last_ns > BURST_S * NS:
             return 0
         told, sigma = before.predict(x)
-        run = run + 1 if abs(y - told) <= max(before.least_ns / 2, 3 * float(np.hypot(sigma, sd))) else 0
+        near = abs(y - told) <= max(before.least_ns / 2, 3 * float(np.hypot(sigma, sd)))
+        run = run + 1 if near and abs(y - told) < abs(y - after.predict(x)[0]) / 2 else 0
         if run == CONFIRM - 1:
             return c - run + 1
     return 0

@@ -11,6 +11,7 @@ from spikerig.dataset.errors import DataError
 from spikerig.dataset.marks import Sight
 
 RESPONSE_NS = 300_000.0  # a wrong response curve moves edges by up to a quarter of 1/240 s, on and off oppositely
+ALLOWED_NS = {"spike": 3_000.0, "rgb": 10_000.0}  # for what no constant describes: an eighth of a tick; 1/200 exposure
 ROW_NS = 400.0  # a row's time may be off by 5 % of 8 us
 
 

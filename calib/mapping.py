@@ -38,6 +38,7 @@ class Options:
         overlap: neighbours on each side for `sequential`.
         mapper: `incremental` or `global`.
         max_image_size: longer sides are made smaller; -1 keeps all.
+        tries: at mapping the same matches; the largest map is kept.
         seed: of RANSAC and of the mapper.
         threads: of features and matching; 0 is one a core. The mapper runs on one. Same seed and threads, same bits;
             another number of threads numbers the matches differently, and gives a nearby answer.
@@ -51,6 +52,7 @@ class Options:
     overlap: int = 10
     mapper: str = "incremental"
     max_image_size: int = -1
+    tries: int = 2
     seed: int = 1
     threads: int = 0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,10 +13,10 @@ from spikerig.dataset.scene import Frame
 from spikerig.dataset.spikes import SpikeStream
 from spikerig.dataset.texture import Texture, tfi, tfp, tfp_adaptive
 
-# What is tried when nothing is asked for. Windows have one mid-time for all pixels; an interval's lies anywhere within
-# it, so TFI maps came out worse than their sharpness and noise promise (docs/poses.md): they are taken on request.
-KINDS = ("tfp48", "tfp64", "tfp96", "tfp128", "tfp192", "adaptive")
+# What is tried when nothing is asked for: windows, intervals, and a window a pixel (what the paper calls HDR).
+KINDS = ("tfp48", "tfp64", "tfp96", "tfp128", "tfp192", "tfi5", "adaptive")
 WHITE = 99.5  # percentile that becomes white
+REFOUND_PX = 1.5  # a feature is found again when it lies that near to where the others say
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,17 +26,25 @@ class Looks:
     Args:
         kind: of texture.
         sharpness: 90th percentile of the gradient, gray levels a pixel.
-        noise: standard deviation, gray levels.
+        noise: standard deviation, gray levels, on flat parts.
+        refound: features of one instant that are found again at another of the same exposure, a view.
+        spread: how far from their place, median, pixels.
     """
 
     kind: str
     sharpness: float
     noise: float
+    refound: float = 0.0
+    spread: float = REFOUND_PX
 
     @property
     def score(self) -> float:
-        """Sharpness over noise; half a gray level of noise is as good as none."""
-        return self.sharpness / np.hypot(self.noise, 0.5)
+        """What poses gain by: the root of the number of features over their spread.
+
+        Sharpness over noise would do where noise is alike everywhere. Where each pixel has a window of its own it is
+        not: noise on flat parts is least, and at the details, where windows jump, most features are lost.
+        """
+        return float(np.sqrt(self.refound) / max(self.spread, 0.05))
 
 
 def texture_of(stream: SpikeStream, at: float, kind: str) -> Texture:
@@ -73,8 +82,17 @@ def frame_picture(frame: Frame) -> NDArray[np.uint8]:
     return (pixels >> 8 if pixels.dtype == np.uint16 else pixels).astype(np.uint8, copy=False)
 
 
-def looks(pictures: list[NDArray[np.uint8]], kind: str) -> Looks:
-    """Sharpness and noise of pictures, each the median over them.
+def looks(
+    pictures: Sequence[NDArray[np.uint8]],
+    kind: str,
+    pairs: Sequence[tuple[NDArray[np.uint8], NDArray[np.uint8]]] = (),
+) -> Looks:
+    """Sharpness and noise of pictures, each the median over them; how well features are found again, the mean.
+
+    Args:
+        pictures: of this kind of texture.
+        kind: its name.
+        pairs: two pictures each, of one exposure at instants that share no spike.
 
     Edges:
         Noise is measured where the picture is smoothest (the lowest quarter of local contrast), so that texture does
@@ -82,7 +100,33 @@ def looks(pictures: list[NDArray[np.uint8]], kind: str) -> Looks:
 
     Source: the noise estimator of Immerkaer 1996, on flat parts.
     """
-    return Looks(kind, *(float(np.median([f(p) for p in pictures])) for f in (_sharpness, _noise)))
+    sharp, noise = (float(np.median([f(p) for p in pictures])) for f in (_sharpness, _noise))
+    found = np.array([refound(*pair) for pair in pairs]).reshape(-1, 2)
+    return Looks(kind, sharp, noise, *(map(float, found.mean(0)) if len(found) else ()))
+
+
+def refound(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> tuple[int, float]:
+    """How many features of picture a are found again in b, and how far from their place (median, pixels).
+
+    Their place is that of an affine motion of the whole picture, the one that most features agree on.
+    """
+    import cv2
+
+    sift = cv2.SIFT.create(contrastThreshold=0.01)  # a third of this is COLMAP's peak threshold
+    points, words = zip(*(sift.detectAndCompute(np.ascontiguousarray(p), None) for p in (a, b)), strict=True)  # pyright: ignore
+    if any(w is None or len(w) < 8 for w in words):
+        return 0, REFOUND_PX
+    pairs = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True).match(*words)
+    here = np.array([points[0][m.queryIdx].pt for m in pairs])
+    there = np.array([points[1][m.trainIdx].pt for m in pairs])
+    if len(pairs) < 8:
+        return 0, REFOUND_PX
+    motion = cv2.estimateAffine2D(here, there, method=cv2.RANSAC, ransacReprojThreshold=REFOUND_PX)[0]
+    if motion is None:
+        return 0, REFOUND_PX
+    off = np.linalg.norm(here @ motion[:, :2].T + motion[:, 2] - there, axis=1)
+    kept = off[off < REFOUND_PX]
+    return len(kept), float(np.median(kept)) if len(kept) else REFOUND_PX
 
 
 def _sharpness(picture: NDArray[np.uint8]) -> float:

@@ -18,7 +18,9 @@ def poses(
     write: Annotated[bool, typer.Option("--write", help="Put the poses into the scene, in place.")] = False,
     write_to: Annotated[Path | None, typer.Option(help="Put the poses into a copy of the scene.")] = None,
     arms: Annotated[str, typer.Option(help="spike, rgb, or both (a rig of fixed relative pose).")] = "spike",
-    kinds: Annotated[str, typer.Option(help="Textures, e.g. tfp96,adaptive; default: by sharpness and noise.")] = "",
+    kinds: Annotated[
+        str, typer.Option(help="Textures, e.g. tfp96,adaptive; default: whose features are found again best.")
+    ] = "",
     maps: Annotated[int, typer.Option(help="Kinds mapped independently; they must agree.")] = 3,
     instants: Annotated[int, typer.Option(help="Poses over each exposure; 1: the middle alone.")] = 5,
     min_share: Annotated[float, typer.Option(help="Of the views that must be placed.")] = 0.8,
@@ -32,7 +34,11 @@ def poses(
     ] = None,
     max_features: Annotated[int, typer.Option(help="A picture.")] = 4096,
     max_image_size: Annotated[int, typer.Option(help="Longer sides are made smaller; -1: never.")] = -1,
+    tries: Annotated[int, typer.Option(min=1, max=9, help="At mapping; the largest map is kept.")] = 2,
+    pattern: Annotated[bool, typer.Option(help="Divide out the sensor's fixed pattern, as the views show it.")] = True,
     shared_camera: Annotated[bool, typer.Option(help="A folder's pictures are of one camera.")] = False,
+    board: Annotated[str, typer.Option(help="Inner corners of a board in view, e.g. 9x6: gives millimetres.")] = "",
+    square_mm: Annotated[float, typer.Option(help="Its squares.")] = 0.0,
     seed: Annotated[int, typer.Option(help="Of RANSAC and of the mapper.")] = 1,
     threads: Annotated[int, typer.Option(help="Of features and matches; 0: one a core.")] = 0,
     sheet: Annotated[Path | None, typer.Option(help="A contact sheet of the scene written (.html).")] = None,
@@ -51,7 +57,7 @@ def poses(
     off = off if max_error_px is None else max_error_px
     options = Options(
         peak if peak_threshold is None else peak_threshold, max_features, pairs=pairs, mapper=mapper, seed=seed,
-        threads=threads, max_error_px=off, max_image_size=max_image_size,
+        threads=threads, max_error_px=off, max_image_size=max_image_size, tries=tries,
     )  # fmt: skip
     if out is not None and (out / "poses.json").exists() and not force:
         raise UsageError("there is an earlier result", value=out / "poses.json", next="give --force to replace it")
@@ -64,8 +70,9 @@ def poses(
         if write and write_to:
             raise UsageError("give --write or --write-to, not both")
         listed = tuple(k for k in kinds.split(",") if k)
-        wanted = Wanted(arms, listed, min(maps, len(listed)) if listed else maps, instants, min_share, off)
-        told = _scene(source, out, wanted, options, write, write_to, force)
+        wanted = Wanted(arms, listed, min(maps, len(listed)) if listed else maps, instants, min_share, off, pattern)
+        sized = _board(board, square_mm)
+        told = _scene(source, out, wanted, options, write, write_to, force, sized)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         (out / "poses.json").write_text(json.dumps(told, indent=1), encoding="utf-8")
@@ -99,7 +106,14 @@ def _sheet(out: Path, writes: bool, force: bool) -> Any:
 
 
 def _scene(
-    source: Path, out: Path | None, wanted: Any, options: Any, write: bool, write_to: Path | None, force: bool
+    source: Path,
+    out: Path | None,
+    wanted: Any,
+    options: Any,
+    write: bool,
+    write_to: Path | None,
+    force: bool,
+    board: Any,
 ) -> dict[str, Any]:
     from dataclasses import asdict
 
@@ -119,18 +133,50 @@ def _scene(
             done=lambda step: bar.step(1, step),
         )  # fmt: skip
         known = {v.name: v.pose.cam_from_world for v in views}
+        size = _size(views, estimate, scene.camera, board, straight_of(scene))
         origin = origin_of(scene, "h5py")
         simulated = scene.has_truth and "poses" not in scene.info
     told = report(estimate, options)
     told["source"] = str(source)
+    told["wanted"] = asdict(wanted)
+    told["board"] = size
     told["truth"] = against(estimate, known) if simulated else None
     told["forced"] = bool(estimate.reasons) and force
     if (write or write_to) and (told["accepted"] or force):
         left_out = ("poses", "source", "seconds")
-        record = {k: v for k, v in told.items() if k not in left_out} | origin | {"wanted": asdict(wanted)}
+        record = {k: v for k, v in told.items() if k not in left_out} | origin
         record["versions"] |= told["versions"]
+        if size and size["mm_per_unit"]:
+            note(f"a unit of the estimate's own world is {size['mm_per_unit']:.2f} mm +- {size['sd']:.2f}")
         told |= write_poses(source, estimate, record, out=write_to, force=force)
     return told
+
+
+def _board(pattern: str, square_mm: float) -> Any:
+    from spikerig.calib.boards import board_of
+
+    if bool(pattern) != (square_mm > 0):
+        raise UsageError("a board needs --board and --square-mm", value=(pattern, square_mm))
+    return board_of(pattern, square_mm) if pattern else None
+
+
+def _size(views: Any, estimate: Any, camera: Any, board: Any, straight: Any) -> dict[str, Any] | None:
+    """Millimetres a unit of the estimate's world, or why not; None where no board was named."""
+    from dataclasses import asdict
+
+    from spikerig.calib.boards import find
+    from spikerig.calib.poses import texture_at
+    from spikerig.calib.scale import Scale, scale_of
+
+    if board is None:
+        return None
+    seen = {
+        v.name: find(texture_at(v, 0.5, "tfp128", None, straight).light, board)
+        for v in views
+        if v.name in estimate.poses
+    }
+    found = scale_of(estimate.poses, {n: f for n, f in seen.items() if f is not None}, camera, board)
+    return asdict(found) if isinstance(found, Scale) else {"mm_per_unit": None, "reason": found}
 
 
 def _folder(source: Path, out: Path | None, options: Any, shared: bool, min_share: float) -> dict[str, Any]:
@@ -162,6 +208,8 @@ def report(estimate: Any, options: Any) -> dict[str, Any]:
     """An estimate, JSON-ready."""
     from dataclasses import asdict
 
+    from spikerig.dataset import machine
+
     best = estimate.best
     inliers = {n: p.inliers for n, p in best.poses.items()}
     return {
@@ -175,7 +223,11 @@ def report(estimate: Any, options: Any) -> dict[str, Any]:
         "points": len(best.xyz),
         "free_focal": dict(best.focal) or None,
         "kinds": list(estimate.kinds),
-        "textures": [{"kind": k.kind, "sharpness": k.sharpness, "noise": k.noise} for k in estimate.looked],
+        "textures": [
+            {"kind": k.kind, "sharpness": k.sharpness, "noise": k.noise, "refound": k.refound, "spread_px": k.spread}
+            for k in estimate.looked
+        ],
+        "pattern_sd": estimate.pattern_sd,
         "agreement": {
             "maps": estimate.agreeing[1],
             "agree": estimate.agreeing[0],
@@ -189,7 +241,7 @@ def report(estimate: Any, options: Any) -> dict[str, Any]:
         "point_residuals": quantiles(best.error),
         "poses": {n: p.tolist() for n, p in sorted(estimate.poses.items())},
         "options": asdict(options),
-        "versions": {"pycolmap": best.version},
+        "versions": machine.describe()["versions"] | {"pycolmap": best.version},
         "seconds": dict(estimate.seconds or best.seconds),
     }
 

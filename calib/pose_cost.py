@@ -37,7 +37,7 @@ class Truth:
     def __init__(self, path: Path, views: int) -> None:
         import numpy as np
 
-        from spikerig.calib.poses import best_kind
+        from spikerig.calib.poses import best_kind, gain_of
         from spikerig.dataset.store import open_scene
 
         with open_scene(path) as scene:
@@ -50,7 +50,8 @@ class Truth:
             self.camera: Camera = scene.camera
             self.paths = {n: scene.truth_trajectory(n) for n in names}
         self.poses = {v.name: np.asarray(v.pose.cam_from_world) for v in self.views}
-        self.kind = best_kind(self.views)
+        self.gain = gain_of(self.views)
+        self.kind = best_kind(self.views, self.gain)
 
     def off(self, poses: Mapping[str, Any]) -> tuple[float, str]:
         """Median degrees from the truth, and a note: share of the extent, and views that were placed."""
@@ -119,7 +120,7 @@ def one_map(truth: Truth, options: Any, times: float) -> Map:
     from spikerig.calib.mapping import build_map
     from spikerig.calib.poses import look_at
 
-    pictures = {v.name: look_at(v, 0.5, truth.kind) for v in truth.views}
+    pictures = {v.name: look_at(v, 0.5, truth.kind, truth.gain) for v in truth.views}
     camera = truth.camera
     if times != 1:
         wide, high = round(camera.width * times), round(camera.height * times)

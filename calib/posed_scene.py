@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -50,7 +51,7 @@ def write_poses(
     Args:
         path: of the scene.
         estimate: accepted.
-        provenance: recorded as info.poses.
+        provenance: recorded as info.poses, with the SHA-256 of what the poses are made of and of the poses.
         out: another file to write; None replaces `path`, which stays as it is until the new one is whole.
         force: replace `out`.
         done: called after each view.
@@ -64,6 +65,7 @@ def write_poses(
     if out is not None:
         refuse_existing(out, force)
     with open_scene(path) as scene, stand_in(target, "poses") as beside:
+        provenance = dict(provenance) | {"sha256": _hashes(scene, estimate)}
         earlier = {n: scene.view(n, spikes=False).pose.cam_from_world for n in scene.names if n in estimate.images}
         to = onto(estimate, earlier)
         placed = dict(zip(estimate.poses, to.poses(np.stack(list(estimate.poses.values()))), strict=True))
@@ -85,6 +87,21 @@ def write_poses(
                     _copy(scene, writer, name, placed, estimate, to)
                 done()
     return {"written": str(target), "left_out": left_out, "scale": to.scale}
+
+
+def _hashes(scene: SceneFile, estimate: Estimate) -> dict[str, str]:
+    """Of the spikes and times that the poses are made of, view by view, and of the poses and the map's points."""
+    made_of, found = hashlib.sha256(), hashlib.sha256()
+    for name in sorted(set(estimate.images) & set(scene.names)):
+        view = scene.view(name)
+        made_of.update(f"{name}:{view.frame.start_ns}:{view.frame.row_ns}:{view.frame.exposure_ns}\0".encode())
+        if view.spikes is not None:
+            made_of.update(f"{view.spikes.t0_ns}:{view.spikes.rate_hz}:{view.spikes.bits.shape}\0".encode())
+            made_of.update(np.ascontiguousarray(view.spikes.bits).data)
+    for name, pose in sorted(estimate.poses.items()):
+        found.update(name.encode() + b"\0" + np.ascontiguousarray(pose, "<f8").tobytes())
+    found.update(np.ascontiguousarray(estimate.best.xyz, "<f8").tobytes())
+    return {"spikes": made_of.hexdigest(), "poses": found.hexdigest()}
 
 
 def _copy(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,16 +14,19 @@ from numpy.typing import NDArray
 from spikerig.calib.consensus import Path, agree, apart_by, averaged, paths_through
 from spikerig.calib.gauge import centres, extent
 from spikerig.calib.mapping import Map, Options, build_map
+from spikerig.calib.pattern import fixed_pattern
 from spikerig.calib.pictures import KINDS, Looks, frame_picture, looks, picture_of, texture_of
 from spikerig.calib.straight import Straight
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.scene import Camera, View
+from spikerig.dataset.texture import Texture
 
 Floats = NDArray[np.float64]
 LOOKED_AT = 6  # views on which the kinds of texture are judged
+APART = (0.2, 0.8)  # phases of the two instants that features are compared between: windows share no spike
 # A free focal length that is off by the first, and takes the second of the residual with it, says that K is wrong.
 WRONG_FOCAL = ((0.05, 0.02), (0.2, 0.003))
-HARDER = Options(peak_threshold=0.0015, max_ratio=0.85)
+HARDER = {"peak_threshold": 0.0015, "max_ratio": 0.85}
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,11 +35,12 @@ class Wanted:
 
     Args:
         arms: pictures of the `spike` arm, of `rgb`, or of `both` as a COLMAP rig of fixed relative pose.
-        kinds: of texture; empty chooses by measured sharpness and noise.
+        kinds: of texture; empty chooses by how many features are found again, and how near (sharpness and noise).
         maps: how many kinds of texture are mapped independently; two or more can disagree, and then nothing is kept.
         instants: poses over each exposure, ends included; 1 gives the middle alone.
         min_share: of the views that must be placed.
         max_error_px: mean residual above which a map is refused.
+        pattern: the sensor's fixed pattern, measured on the views themselves, is divided out of their textures.
     """
 
     arms: str = "spike"
@@ -43,6 +49,7 @@ class Wanted:
     instants: int = 5
     min_share: float = 0.8
     max_error_px: float = 1.5
+    pattern: bool = True
 
     def __post_init__(self) -> None:
         if self.arms not in ("spike", "rgb", "both"):
@@ -67,6 +74,7 @@ class Estimate:
         agreement_deg, agreement_share: largest median difference between the maps that agree.
         agreeing: how many of the maps agree with the best, itself included, and how many there were.
         reasons: why it is refused; empty when it is not.
+        pattern_sd: of the fixed pattern that was divided out (a share of the light); None: nothing was.
     """
 
     images: tuple[str, ...]
@@ -80,6 +88,7 @@ class Estimate:
     agreeing: tuple[int, int] = (1, 1)
     reasons: tuple[str, ...] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)
+    pattern_sd: float | None = None
 
 
 def estimate_poses(
@@ -104,7 +113,7 @@ def estimate_poses(
         spike_from_rgb: [3,4] for `both`; None: one centre, one direction.
         straight: what puts textures of raw spikes onto `camera`.
         keep: folder for COLMAP's files of the best map.
-        done: called with the name of each step.
+        done: called with the name of each step, by several threads.
 
     Returns:
         The estimate; look at `reasons` before using it.
@@ -124,54 +133,53 @@ def estimate_poses(
         pictures = {v.name: frame_picture(v.frame) for v in usable}
         found = build_map(pictures, rgb_camera or camera, options, keep=keep, done=done)
         return _judged(Estimate(names, {n: p.pose for n, p in found.poses.items()}, {}, found, ("rgb",)), wanted)
-    ranked = _ranked(usable, wanted, straight)
+    gain = gain_of(usable) if wanted.pattern else None
+    ranked = _ranked(usable, wanted, gain, straight)
+    done("textures ranked")
     kinds = wanted.kinds or tuple(look.kind for look in ranked)
-    rigged = _Rigged(usable, camera, wanted, options, rgb_camera or camera, spike_from_rgb, straight, keep, done)
-    maps: dict[str, Map] = {}
-    for kind in kinds[: wanted.maps]:
-        maps[kind] = rigged.map(kind, first=not maps)
+    rigged = _Rigged(usable, camera, wanted, options, rgb_camera or camera, spike_from_rgb, keep, done, gain, straight)
+    maps = _side_by_side(rigged, kinds[: wanted.maps])
     enough = wanted.min_share * len(usable)
     spare = [k for k in kinds[wanted.maps :] if k not in maps]
     while max(len(m.poses) for m in maps.values()) < enough and spare:
         kind = spare.pop(0)
         maps[kind] = rigged.map(kind)
     if max(len(m.poses) for m in maps.values()) < enough:
-        harder = replace(HARDER, seed=options.seed, threads=options.threads, max_error_px=options.max_error_px)
-        rigged.options = harder
-        maps[f"{kinds[0]}, low contrast"] = rigged.map(kinds[0])
+        harder = replace(options, **HARDER)
+        maps[f"{kinds[0]}, low contrast"] = replace(rigged, options=harder).map(kinds[0])
     return _judged(_settled(rigged, maps, names, ranked), wanted)
 
 
+@dataclass(frozen=True, slots=True)
 class _Rigged:
     """Maps of one scene by kind of texture, with what they share."""
 
-    def __init__(
-        self,
-        views: Sequence[View],
-        camera: Camera,
-        wanted: Wanted,
-        options: Options,
-        rgb_camera: Camera,
-        spike_from_rgb: Floats | None,
-        straight: Straight,
-        keep: Any,
-        done: Callable[[str], None],
-    ) -> None:
-        self.views, self.camera, self.wanted, self.options = views, camera, wanted, options
-        self.rgb_camera, self.spike_from_rgb, self.keep, self.done = rgb_camera, spike_from_rgb, keep, done
-        self.straight = straight
-        self.phases = np.linspace(0, 1, wanted.instants) if wanted.instants > 1 else np.array([0.5])
+    views: Sequence[View]
+    camera: Camera
+    wanted: Wanted
+    options: Options
+    rgb_camera: Camera
+    spike_from_rgb: Floats | None
+    keep: Any
+    done: Callable[[str], None]
+    gain: Floats | None
+    straight: Straight
+
+    @property
+    def phases(self) -> Floats:
+        """Of the exposure, at which poses are asked for."""
+        return np.linspace(0, 1, self.wanted.instants) if self.wanted.instants > 1 else np.array([0.5])
 
     def map(self, kind: str, first: bool = False) -> Map:
         """Map the middle instants by one kind of texture; the first map also takes the further instants."""
         folder = "spike/" if self.wanted.arms == "both" else ""
-        pictures = {f"{folder}{v.name}": look_at(v, 0.5, kind, self.straight) for v in self.views}
+        pictures = {f"{folder}{v.name}": look_at(v, 0.5, kind, self.gain, self.straight) for v in self.views}
         further = {}
         if first and self.wanted.instants > 1:
             for v in self.views:
                 for k, phase in enumerate(self.phases):
                     if abs(phase - 0.5) > 1e-9:
-                        picture = look_at(v, phase, kind, self.straight)
+                        picture = look_at(v, phase, kind, self.gain, self.straight)
                         further[f"{folder}{v.name}.at{k:03d}"] = (f"{folder}{v.name}", picture)
         rig = None
         if self.wanted.arms == "both":
@@ -189,6 +197,16 @@ class _Rigged:
             done=lambda name: self.done(step + name),
         )
         return found if not folder else _arm(found, folder)
+
+
+def _side_by_side(rigged: _Rigged, kinds: Sequence[str]) -> dict[str, Map]:
+    """A map by each kind, each in a COLMAP of its own: much of COLMAP runs on one thread, so two run on two cores."""
+    threads = rigged.options.threads or len(os.sched_getaffinity(0))
+    at_once = max(1, min(threads, len(kinds)))
+    each = replace(rigged, options=replace(rigged.options, threads=max(1, threads // at_once)))
+    with ThreadPoolExecutor(at_once) as pool:
+        running = [pool.submit(each.map, kind, kind == kinds[0]) for kind in kinds]
+        return {kind: future.result() for kind, future in zip(kinds, running, strict=True)}
 
 
 def rig_config(spike: Camera, rgb: Camera, spike_from_rgb: Floats | None) -> list[dict[str, Any]]:
@@ -229,14 +247,33 @@ def quaternion(R: Floats) -> Floats:
     return q if q[0] >= 0 else -q
 
 
-def look_at(view: View, phase: float, kind: str, straight: Straight = Straight()) -> NDArray[np.uint8]:
-    """The picture of a view by a kind of texture, at a phase of the exposure; `straight` as in `estimate_poses`."""
+def gain_of(views: Sequence[View]) -> Floats | None:
+    """The fixed pattern of the views' sensor, where there are views enough to tell it."""
+    return fixed_pattern([v.spikes for v in views if v.spikes is not None])
+
+
+def look_at(
+    view: View, phase: float, kind: str, gain: Floats | None = None, straight: Straight = Straight()
+) -> NDArray[np.uint8]:
+    """The picture of a view by a kind of texture, at a phase of the exposure; the others as in `texture_at`."""
     if view.spikes is None:
         raise UsageError("this view has no spikes", value=view.name)
     if kind[:3] == "tfp" and kind[3:].isdigit() and int(kind[3:]) > view.spikes.ticks:
         told = f"{view.name}, {kind}: {view.spikes.ticks} ticks"
         raise UsageError("a texture does not fit the spikes", value=told, next="ask for a shorter window")
-    return picture_of(straight.texture(texture_of(view.spikes, tick_at(view, phase), kind)))
+    return picture_of(texture_at(view, phase, kind, gain, straight))
+
+
+def texture_at(
+    view: View, phase: float, kind: str, gain: Floats | None = None, straight: Straight = Straight()
+) -> Texture:
+    """The texture of a view by a kind, at a phase of the exposure; divided by the gain, then put straight."""
+    if view.spikes is None:
+        raise UsageError("this view has no spikes", value=view.name)
+    raw = texture_of(view.spikes, tick_at(view, phase), kind)
+    if gain is not None:
+        raw = replace(raw, light=(raw.light / gain).astype(np.float32))
+    return straight.texture(raw)
 
 
 def tick_at(view: View, phase: float) -> float:
@@ -248,13 +285,16 @@ def tick_at(view: View, phase: float) -> float:
     return float((start + phase * frame.exposure_ns - spikes.t0_ns) * spikes.rate_hz * 1e-9)
 
 
-def _ranked(views: Sequence[View], wanted: Wanted, straight: Straight) -> tuple[Looks, ...]:
+def _ranked(views: Sequence[View], wanted: Wanted, gain: Floats | None, straight: Straight) -> tuple[Looks, ...]:
     """Kinds of texture, best first, as measured on a few views; kinds whose window leaves the spikes are left out."""
+    if len(wanted.kinds) == 1:
+        return ()
     some = [views[k] for k in np.unique(np.linspace(0, len(views) - 1, LOOKED_AT).round().astype(int))]
     found = []
     for kind in wanted.kinds or KINDS:
         try:
-            found.append(looks([look_at(v, 0.5, kind, straight) for v in some], kind))
+            pairs = [tuple(look_at(v, phase, kind, gain, straight) for phase in APART) for v in some]
+            found.append(looks([p for pair in pairs for p in pair], kind, [(a, b) for a, b in pairs]))
         except UsageError:
             if wanted.kinds:
                 raise
@@ -263,9 +303,9 @@ def _ranked(views: Sequence[View], wanted: Wanted, straight: Straight) -> tuple[
     return tuple(sorted(found, key=lambda look: -look.score))
 
 
-def best_kind(views: Sequence[View]) -> str:
-    """The kind of texture that looks best on these views, by measured sharpness and noise."""
-    return _ranked(views, Wanted(), Straight())[0].kind
+def best_kind(views: Sequence[View], gain: Floats | None = None) -> str:
+    """The kind of texture whose features are found again best on these views."""
+    return _ranked(views, Wanted(), gain, Straight())[0].kind
 
 
 def _arm(found: Map, folder: str) -> Map:
@@ -306,6 +346,7 @@ def _settled(rigged: _Rigged, maps: Mapping[str, Map], names: tuple[str, ...], r
         (len(group), len(maps)),
         (),
         seconds,
+        None if rigged.gain is None else float(np.std(np.log(rigged.gain))),
     )
 
 

@@ -208,10 +208,10 @@ class Path:
 
 
 def _path(look: ViewLook) -> Path:
-    path, frame = look.view.trajectory, look.frame
+    path = look.view.trajectory
     if path is None:
         raise Undecided("no path")
-    return Path(look.view.pose, path, look.view.instant_ns(0.0), frame.exposure_ns)
+    return Path(look.view.pose, path, look.view.instant_ns(0.0), look.frame.exposure_ns)
 
 
 @check(

@@ -99,6 +99,8 @@ def run(argv: list[str]) -> int:
     as_json = "--json" in argv
     try:
         result = assemble(argv)(args=argv, standalone_mode=False, prog_name="spikerig")
+        if result == 130:  # typer's own way to tell of an interrupt
+            return _interrupted(as_json)
         return result if isinstance(result, int) else 0
     except RigError as error:
         return _tell(error.as_json(), str(error), error.exit_code, as_json)
@@ -112,7 +114,7 @@ def run(argv: list[str]) -> int:
     except typer.Exit as leave:
         return leave.exit_code
     except (KeyboardInterrupt, typer.Abort):
-        return _tell({"type": "Interrupted", "exit_code": 130, "what": "interrupted"}, "interrupted", 130, as_json)
+        return _interrupted(as_json)
     except BrokenPipeError:  # `spikerig ... | head`
         sys.stderr.close()
         return 0
@@ -137,6 +139,10 @@ def _tell(record: dict[str, object], text: str, code: int, as_json: bool) -> int
         emit("spikerig.error/1", {"error": record})
     note("error: " + text)
     return code
+
+
+def _interrupted(as_json: bool) -> int:
+    return _tell({"type": "Interrupted", "exit_code": 130, "what": "interrupted"}, "interrupted", 130, as_json)
 
 
 def _bug(error: Exception, argv: list[str], as_json: bool) -> int:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,36 +18,11 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.clocktime import NS, frozen_array
 from spikerig.dataset.errors import DataError, UsageError
-from spikerig.dataset.gopro_times import frame_times, nearest, sample_times
-from spikerig.dataset.gpmf import Stream, header, streams
-from spikerig.dataset.mp4_boxes import Movie, Track, damaged, read_movie, read_samples
+from spikerig.dataset.gopro_chapter import Chapter, Samples, read_chapter
+from spikerig.dataset.gopro_times import nearest
 
 CHAPTER = re.compile(r"(G[HXML])(\d\d)(\d{4})\.MP4", re.IGNORECASE)  # HEVC GX, AVC GH; chapter; number of the clip
 LONGEST_S = 60.0  # an exposure or a read-out beyond it is no such thing
-
-
-@dataclass(frozen=True, slots=True)
-class Samples:
-    """One sensor's samples over a whole clip.
-
-    Args:
-        name, unit: as the camera tells them.
-        at_ns: int64[N], the camera's media time of each sample, interpolated between the stamps.
-        values: float64[N,C], scaled to the unit.
-        stamped: times come from the camera's stamps (STMP); False: samples are spread evenly over each payload.
-        extra: single numbers that came with the last payload, e.g. TMPC, the temperature in degrees Celsius.
-    """
-
-    name: str
-    unit: str
-    at_ns: NDArray[np.int64]
-    values: NDArray[np.float64]
-    stamped: bool
-    extra: Mapping[str, float] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "at_ns", frozen_array(self.at_ns, np.int64))
-        object.__setattr__(self, "values", frozen_array(self.values, np.float64))
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,19 +91,6 @@ class GoProClip:
         return range(int(first), int(last))
 
 
-@dataclass
-class _Chapter:
-    """One file, timed by itself."""
-
-    path: Path
-    video: Track
-    settings: dict[str, Any]
-    start_ns: NDArray[np.int64]
-    source: str
-    streams: dict[str, Samples]
-    remarks: list[str]
-
-
 def chapters(path: str | Path) -> list[Path]:
     """The chapters of the clip that a file belongs to, in order, those that lie beside it: GX010042, GX020042, ...
 
@@ -163,12 +125,12 @@ def open_gopro(path: str | Path | Sequence[str | Path]) -> GoProClip:
         HostError: a file may not be read.
 
     Cost:
-        Some 10 ms and 0.5 ms a second of clip; the pictures are not read.
+        Some 10 ms and 1 ms a second of clip; the pictures are not read.
     """
     given = [Path(path)] if isinstance(path, str | Path) else [Path(p) for p in path]
     if not given:
         raise UsageError("a clip needs at least one file", value=[])
-    parts = [_chapter(p) for p in given]
+    parts = [read_chapter(p) for p in given]
     first = parts[0]
     for part in parts[1:]:
         same = [(p.video.width, p.video.height, p.video.format, p.settings.get("CASN")) for p in (first, part)]
@@ -202,70 +164,7 @@ def open_gopro(path: str | Path | Sequence[str | Path]) -> GoProClip:
     )
 
 
-def _chapter(path: Path) -> _Chapter:
-    movie = read_movie(path)
-    video = next((t for t in movie.tracks if t.handler == "vide" and len(t.sizes)), None)
-    if video is None:
-        raise damaged(path, "there is no video in it")
-    if not video.durations.sum() or not (video.width and video.height):
-        raise damaged(path, "its video has no length or no size")
-    grid_ns = np.rint((np.sort(video.pts) - video.pts.min()) * (NS / video.timescale)).astype(np.int64)
-    try:
-        told = header(movie.user.get("GPMF", b"")).get("1", {})
-        payloads, track = _payloads(movie)
-        start_ns, source, remarks = _frames(payloads, grid_ns)
-        found = {key: _samples(key, payloads, track) for key in dict.fromkeys(k for p in payloads for k in p)}
-    except DataError as error:
-        raise DataError(error.what, value=path, cause=error.cause, next=error.next) from error
-    return _Chapter(path, video, told, start_ns, source, found, remarks)
-
-
-def _payloads(movie: Movie) -> tuple[list[dict[str, Stream]], Track | None]:
-    """The streams of each payload by key, the first of each; and the track they lie in."""
-    track = next((t for t in movie.tracks if t.format == "gpmd"), None)
-    found: list[dict[str, Stream]] = []
-    for payload in read_samples(movie.path, track) if track else ():
-        by_key: dict[str, Stream] = {}
-        for stream in streams(payload):
-            by_key.setdefault(stream.key, stream)
-        found.append(by_key)
-    return found, track
-
-
-def _frames(payloads: list[dict[str, Stream]], grid_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], str, list[str]]:
-    if not payloads:
-        return grid_ns, "pts", ["no telemetry: times are the video's own grid, exposures are not known"]
-    cori = [p["CORI"] for p in payloads if "CORI" in p and p["CORI"].stamp_us is not None]
-    if not cori:
-        return grid_ns, "pts", ["no stamps of frames (CORI): times are the video's own grid"]
-    remarks = []
-    stamped = sum(len(s.values) for s in cori)
-    if abs(stamped - len(grid_ns)) > 2:
-        remarks.append(f"{stamped} stamps of frames (CORI) for {len(grid_ns)} frames")
-    skips = [p["MSKP"] for p in payloads if "MSKP" in p]
-    counted = sum(len(s.values) for s in skips)
-    if skips and counted != stamped:
-        remarks.append(f"{counted} counts of skipped frames (MSKP) for {stamped} frames: not used")
-        skips = []
-    start_ns = frame_times(cori, skips, grid_ns)
-    odd = int(sum(np.abs(s.values[:, 0]).sum() for s in skips))
-    if odd:
-        remarks.append(f"{odd} frames skipped or repeated between sensor and encoder (MSKP)")
-    return start_ns, "CORI", remarks
-
-
-def _samples(key: str, payloads: list[dict[str, Stream]], track: Track | None) -> Samples:
-    held = [(n, p[key]) for n, p in enumerate(payloads) if key in p]
-    if track is None or len({s.values.shape[1] for _, s in held}) != 1:
-        raise DataError("the telemetry contradicts itself", cause=f"{key} changes its number of columns")
-    rows, unit_us = [n for n, _ in held], np.float64(1e6 / track.timescale)
-    found = [s for _, s in held]
-    at_ns, stamped = sample_times(key, found, track.dts[rows] * unit_us, track.durations[rows] * unit_us)
-    last = found[-1]
-    return Samples(last.name, last.unit, at_ns, np.concatenate([s.values for s in found]), stamped, last.extra)
-
-
-def _follow(parts: list[_Chapter]) -> list[str]:
+def _follow(parts: list[Chapter]) -> list[str]:
     """Shift chapters whose stamps begin anew to follow the one before; tells which."""
     remarks = []
     for before, part in itertools.pairwise(parts):
@@ -280,7 +179,7 @@ def _follow(parts: list[_Chapter]) -> list[str]:
     return remarks
 
 
-def _joined(parts: list[_Chapter]) -> dict[str, Samples]:
+def _joined(parts: list[Chapter]) -> dict[str, Samples]:
     found: dict[str, Samples] = {}
     for key in dict.fromkeys(k for p in parts for k in p.streams):
         held = [p.streams[key] for p in parts if key in p.streams]
@@ -291,17 +190,15 @@ def _joined(parts: list[_Chapter]) -> dict[str, Samples]:
     return found
 
 
-def _for_frames(parts: list[_Chapter], key: str) -> NDArray[np.float64] | None:
-    """The first column of a stream for each frame: by number where there is one a frame, else the nearest in time."""
+def _for_frames(parts: list[Chapter], key: str) -> NDArray[np.float64] | None:
+    """The first column of a stream for each frame: the sample nearest in time, or by number without stamps."""
     if any(key not in p.streams or not len(p.streams[key].values) for p in parts):
         return None
     found = []
     for part in parts:
         samples, frames = part.streams[key], len(part.start_ns)
-        if part.source == "CORI" and len(samples.values) == len(part.streams["CORI"].values):
-            rows = np.minimum(np.arange(frames), len(samples.values) - 1)
-        elif part.source == "CORI" and samples.stamped:
-            rows = nearest(samples.at_ns, part.start_ns)
+        if part.source == "CORI" and samples.stamped:
+            rows = nearest(np.maximum.accumulate(samples.at_ns), part.start_ns)
         else:
             rows = ((np.arange(frames) + 0.5) * len(samples.values) / frames).astype(np.intp)
         found.append(samples.values[rows, 0])

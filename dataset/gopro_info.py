@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from spikerig.dataset.gopro_file import GoProClip, Samples, chapters, open_gopro
+from spikerig.dataset.gopro_chapter import Samples
+from spikerig.dataset.gopro_file import GoProClip, chapters, open_gopro
 from spikerig.dataset.hdf5_guard import printable
 
 SETTINGS = (

@@ -38,7 +38,7 @@ def read_pictures(clip: GoProClip, numbers: Iterable[int]) -> Iterator[tuple[int
         DataError: the video is damaged where it is read.
 
     Cost:
-        About 5 ms a frame of 1080p, and those since the key frame before it.
+        Each frame asked for is decoded, and those since the key frame before it (docs/hardware/gopro.md, "Cost").
     """
     wanted = np.unique(np.fromiter(numbers, np.int64))
     if len(wanted) and (wanted[0] < 0 or wanted[-1] >= clip.frames):
@@ -105,7 +105,7 @@ def _pixels(path: Path, frame: Any) -> NDArray[Any]:
     matrix = _MATRIX.get(int(frame.colorspace), 1 if frame.height >= 720 else 5)
     return frame.reformat(
         format="rgb48le" if deep else "rgb24", src_colorspace=matrix, dst_color_range=2,
-        src_color_range=2 if full else 1,
+        src_color_range=2 if full else 1, threads=1,
     ).to_ndarray()  # fmt: skip
 
 

@@ -21,7 +21,7 @@ def bad_stamps(cause: str) -> DataError:
 
 
 def frame_times(cori: Sequence[Stream], skips: Sequence[Stream], grid_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Start of each frame, int64 ns of the camera's media time.
+    """Start of each frame, int64[max(N, stamps)] ns of the camera's media time; N of them are frames of the video.
 
     A payload's stamp is the start of its first frame; the frames between two stamps are spread evenly over the
     sensor's frames, of which MSKP tells how many were left out. Beyond the last stamp they go on at the last pace.
@@ -49,12 +49,12 @@ def frame_times(cori: Sequence[Stream], skips: Sequence[Stream], grid_ns: NDArra
     nominal = float(grid_ns[-1] - grid_ns[0]) / 1e3 / max(frames - 1, 1) or 1e6 / 30
     first = np.cumsum(counts) - counts
     knots, stamps = sensor[np.minimum(first, longest - 1)], _stamps(cori)
-    at_us = through("CORI", knots, stamps, sensor[:frames], nominal)
+    at_us = through("CORI", knots, stamps, sensor, nominal)
     return np.rint(at_us * 1e3).astype(np.int64)
 
 
 def sample_times(
-    key: str, held: Sequence[Stream], begun_us: Floats, lasts_us: Floats
+    key: str, held: Sequence[Stream], begun_us: Floats, lasts_us: Floats, frames: Sequence[NDArray[np.int64] | None]
 ) -> tuple[NDArray[np.int64], bool]:
     """Times of a stream's samples, int64 ns, and whether the camera's stamps gave them.
 
@@ -62,6 +62,7 @@ def sample_times(
         key: of the stream, for messages.
         held: the stream of each payload that has it.
         begun_us, lasts_us: float64[P], media time and duration of those payloads by the telemetry track.
+        frames: starts of the frames of each of those payloads: as many samples as frames are one a frame.
     """
     counts = np.array([len(s.values) for s in held])
     first = (np.cumsum(counts) - counts).astype(np.float64)
@@ -69,7 +70,11 @@ def sample_times(
     if all(s.stamp_us is not None for s in held) and len(number):
         nominal = float(lasts_us.sum()) / len(number) or 1e6
         at_us = through(key, first, _stamps(held), number, nominal, strict=False)
-        return np.rint(at_us * 1e3).astype(np.int64), True
+        at_ns = np.rint(at_us * 1e3).astype(np.int64)
+        for begin, many, starts in zip(first.astype(int), counts, frames, strict=True):
+            if starts is not None and len(starts) == many:
+                at_ns[begin : begin + many] = starts
+        return at_ns, True
     steps = np.repeat(lasts_us / np.maximum(counts, 1), counts)
     at_us = np.repeat(begun_us, counts) + steps * (number - np.repeat(first, counts))
     return np.rint(at_us * 1e3).astype(np.int64), False

@@ -39,7 +39,7 @@ class Stream:
     Args:
         key: four letters, e.g. "SHUT".
         name, unit: as the camera tells them.
-        values: float64[N,C], scaled to the unit.
+        values: float64[N,C], scaled to the unit, on the axes that ORIO names (Z, X, Y for a GoPro's motion sensors).
         stamp_us: camera time of the first sample (STMP); None where the camera gives none.
         total: samples since the clip's start, these included (TSMP); None likewise.
         extra: single numbers that came with it (TMPC, ...).
@@ -171,7 +171,7 @@ def _stream(strm: Item) -> Stream | None:
         parts = [p.reshape(1, -1) for p in parts]  # a key that comes again and again: each time one sample
     if len({p.shape[1] for p in parts}) != 1:
         raise broken(f"{last.key} changes its number of columns")
-    rows = np.concatenate(parts)
+    rows = _turned(np.concatenate(parts), told.get("MTRX"))
     units = next((value(told[k]) for k in ("SIUN", "UNIT") if k in told and told[k].kind == "c"), "")
     unit = ",".join(units) if isinstance(units, list) else units
     extra = {
@@ -180,6 +180,17 @@ def _stream(strm: Item) -> Stream | None:
     name = str(value(told["STNM"])) if "STNM" in told else ""
     stamp, total = _count(told.get("STMP")), _count(told.get("TSMP"))
     return Stream(last.key, name, unit, rows, stamp, total, extra)
+
+
+def _turned(rows: NDArray[np.float64], matrix: Item | None) -> NDArray[np.float64]:
+    """Channels as the sensor is mounted to the camera's axes (those that ORIO names), where the camera tells how."""
+    columns = rows.shape[1]
+    if matrix is None or matrix.kind != "f" or len(matrix.payload) != 4 * columns**2:
+        return rows
+    turn = numbers(matrix, "f").reshape(columns, columns)
+    if not np.all(np.abs(turn) <= 1):  # catches NaN
+        raise broken("MTRX is no rotation")
+    return rows @ turn.T
 
 
 def _count(item: Item | None) -> int | None:

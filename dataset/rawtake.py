@@ -209,6 +209,14 @@ class WireBytes:
             missing.append((at, stop))
         return out, missing
 
+    def suspect(self, epoch: int, start: int, stop: int) -> list[tuple[int, int]]:
+        """Which of these bytes of an epoch may lie behind a loss that ended it."""
+        end = self.span(epoch)[1]
+        after = self.chunks.get(epoch + 1, [])
+        bytes_ = after[0].head.suspect if after else 0
+        first = max(start, end - bytes_)
+        return [(first, min(stop, end))] if first < min(stop, end) else []
+
     def _payload(self, chunk: Chunk) -> NDArray[np.uint8] | None:
         if self._held is None or self._held[0] is not chunk:
             try:

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from spikerig.dataset.clocktime import NS
-from spikerig.dataset.errors import DeviceError, UsageError
+from spikerig.dataset.errors import DeviceError, RigError, UsageError
 from spikerig.rigctl import gopro_ble as ble
 from spikerig.rigctl.devices import Clip, DeviceFacts
-from spikerig.rigctl.gopro_http import Dark, Media, Web
-from spikerig.rigctl.gopro_radio import Radio
+from spikerig.rigctl.gopro_http import ADDRESS, Dark, Media, Web, Wifi
+from spikerig.rigctl.gopro_radio import BleLink, Radio
 from spikerig.rigctl.gopro_settle import settle
 from spikerig.rigctl.gopro_watch import Watch
 from spikerig.rigctl.host import Host
@@ -32,7 +32,7 @@ class GoProSource:
         radio: Bluetooth to it; None: a person presses the button.
         say: tells that person what to do.
         patience_s: how long the camera, or the person, may take for a start or a stop.
-        facts: as `find` told them; asked for where not given.
+        facts: as `identify` told them; asked for where not given.
 
     Raises:
         DeviceError: it does not answer.
@@ -43,7 +43,7 @@ class GoProSource:
         patience_s: float = 30.0, facts: DeviceFacts | None = None,
     ) -> None:  # fmt: skip
         self.host, self.web, self.radio, self.say = host, web, radio, say
-        self.facts = facts or find(host, web, radio)[0]
+        self.facts = facts or identify(host, web, radio)
         self._watch = Watch(host, web, radio, patience_s)
         self._started: tuple[int, int] | None = None
         self._before: set[str] = set()
@@ -214,22 +214,74 @@ class GoProSource:
             self.radio.close()
 
 
-def find(host: Host, web: Web, radio: Radio | None = None) -> list[DeviceFacts]:
+def open_gopro(
+    host: Host, *, link: str = "ble", name: str = "", address: str = ADDRESS,
+    say: Callable[[str], None] = lambda text: None,
+) -> GoProSource:  # fmt: skip
+    """A real camera.
+
+    Args:
+        host: the clock that waiting goes by.
+        link: "ble": controlled over Bluetooth; "hand": a person presses the button.
+        name: part of its Bluetooth name; empty: the first one heard.
+        address: of its server.
+        say: tells the person what to do.
+
+    Raises:
+        UsageError: no such link.
+        DeviceError: it does not answer.
+        HostError: bleak is not installed.
+    """
+    if link not in ("ble", "hand"):
+        raise UsageError("no such link to a GoPro", value=link, expected="ble or hand")
+    radio = Radio(lambda: _bleak_link(name), host) if link == "ble" else None
+    return GoProSource(host, Web(Wifi(address), host), radio, say=say)
+
+
+def find(host: Host, web: Web | None = None, radio: Radio | None = None) -> tuple[list[DeviceFacts], list[str]]:
+    """Look for a camera: over Bluetooth, and where that brings none over WiFi.
+
+    Args:
+        host: the clock that waiting goes by.
+        web, radio: to it; None: this machine's, one try.
+
+    Returns:
+        The camera found, and a line for each way that did not lead to it, with the reason.
+    """
+    web = web or Web(Wifi(), host)
+    radio = radio or Radio(lambda: _bleak_link(""), host, tries=1)
+    reasons: list[str] = []
+    for way, over in (("Bluetooth", radio), ("WiFi", None)):
+        try:
+            return [identify(host, web, over)], reasons
+        except RigError as error:
+            reasons.append(f"GoPro over {way}: {error.what}" + (f" ({error.cause})" if error.cause else ""))
+        finally:
+            radio.close()
+    return [], reasons
+
+
+def identify(host: Host, web: Web, radio: Radio | None) -> DeviceFacts:
     """The camera that answers: over Bluetooth with model, serial and firmware; over HTTP only that it is there.
 
     Raises:
-        DeviceError: it answers neither way.
+        DeviceError: it does not answer.
     """
     address = getattr(web.opener, "address", "")
-    more: dict[str, Any] = {"link": "hand" if radio is None else "ble"}
     if radio is None:
-        more["http_version"] = web.version()
+        more = {"link": "hand", "http_version": web.version()}
         ssid = web.state()[0].get(ble.AP_SSID)
-        return [DeviceFacts("rgb", "GoPro", str(ssid or ""), "", address, more)]
+        return DeviceFacts("rgb", "GoPro", str(ssid or ""), "", address, more)
     told = ble.hardware(_patiently(host, radio))
-    radio.do(ble.AP, b"\x01")
-    more["ssid"] = told.get("ssid", "")
-    return [DeviceFacts("rgb", told.get("model", ""), told.get("serial", ""), told.get("firmware", ""), address, more)]
+    radio.do(ble.AP, b"\x01")  # its network, for the files
+    more = {"link": "ble", "ssid": told.get("ssid", "")}
+    return DeviceFacts("rgb", told.get("model", ""), told.get("serial", ""), told.get("firmware", ""), address, more)
+
+
+def _bleak_link(name: str) -> BleLink:
+    from spikerig.rigctl.gopro_bleak import BleakLink
+
+    return BleakLink(name)
 
 
 def _patiently(host: Host, radio: Radio) -> bytes:

@@ -56,6 +56,17 @@ class RealHost:
         boot = getattr(time, "CLOCK_BOOTTIME", None)
         return 0 if boot is None else max(time.clock_gettime_ns(boot) - time.monotonic_ns(), 0)
 
+    def delayed_ns(self) -> int:
+        """How long this thread has waited for a processor in its life; 0 where the system does not tell (Linux does).
+
+        What a driver subtracts to know when bytes came, and not when it was let to look.
+        """
+        try:
+            with open("/proc/thread-self/schedstat", "rb") as file:
+                return int(file.read().split()[1])
+        except (OSError, IndexError, ValueError):
+            return 0
+
     def worker(self, name: str) -> AbstractContextManager[None]:
         """Nothing: real time waits for nobody."""
         return nullcontext()

@@ -12,7 +12,12 @@ from spikerig.dataset.clocktime import NS
 _KNOWN_S = 2.0  # of pairs' distances together, from which a rate is told
 _BIN_BLOCKS = 4  # blocks of which the most punctual one speaks
 _BINS = 64  # kept
-_SETTLED = 3  # blocks in a row that must agree before a loss is told
+_SETTLED = 4  # late blocks that must agree before a loss is told,
+_WINDOW = 16  # or so many that waited in a row, whatever they say
+_PUNCTUAL_NS = 200_000  # scatter of a host not known yet, and the most that is believed
+_LEVEL = 10  # late blocks that are compared
+_DOUBT_NS = 2_000_000_000  # without one block in time: no memory bridges that
+_LASTING_NS = 100_000_000  # that it must last: a host that is slow for a moment catches up
 _QUICK = 0.9  # of the time in which the camera makes a block's bytes
 _ODD = 1e-3  # no crystal is so far off: a rate like that is not taken over
 _SPREAD = 64  # blocks of which the scatter is known
@@ -77,7 +82,9 @@ class Pace:
         """
         # the most punctual moment: time and bytes
         self._at: tuple[int, int] | None = None if at_ns is None else (at_ns, 0)
-        self._lags: list[float] = []
+        self._lag: float | None = None  # of the block before
+        self._row = self._late_ns = 0
+        self._late: list[float] = []  # lags of blocks that waited for the camera and yet were late
         self._piece += 1
         self._bin: list[tuple[float, int, int]] = []
         self.sure_bytes = 0  # of this epoch: all before was in time
@@ -96,8 +103,14 @@ class Pace:
             return 0.0
         return self._rate * (now_ns - self._at[0]) / NS - (total - self._at[1])
 
-    def add(self, before_ns: int, after_ns: int, count: int) -> Lapse | None:
-        """A block asked for at `before_ns` came back at `after_ns` with `count` bytes.
+    def add(self, before_ns: int, after_ns: int, count: int, delay_ns: int = 0) -> Lapse | None:
+        """A block came with `count` bytes.
+
+        Args:
+            before_ns: when it was asked for.
+            after_ns: when it came back: late where the host was, and never early.
+            count: bytes.
+            delay_ns: what of the time between is known to be the host's own delay, before or after the transfer.
 
         Returns:
             A loss, once it is certain; the caller then goes on with `split`.
@@ -112,20 +125,24 @@ class Pace:
         allowed = self._allowed(after_ns)
         if lag <= allowed:
             self.sure_bytes = self.total
-            if self._lags:  # of blocks that waited for the camera
-                self._jumps = [*self._jumps[1 - _SPREAD :], abs(lag - self._lags[-1])]
-        self._lags = [*self._lags[1 - _SETTLED :], lag]
+            if self._lag is not None:
+                self._jumps = [*self._jumps[1 - _SPREAD :], abs(lag - self._lag)]
+        self._lag = lag
         self._fit(lag, after_ns, lag <= allowed)
-        if (
-            after_ns - before_ns
-        ) * self._rate < _QUICK * count * NS:  # faster than they are made: a backlog is read off
-            self._lags = []
-        lowest = min(self._lags, default=0.0)
-        if len(self._lags) < _SETTLED or lowest <= allowed:
+        took = after_ns - before_ns - delay_ns
+        if lag <= allowed or not self._late_ns:
+            self._late, self._row, self._late_ns = [], 0, after_ns
+        elif took * self._rate < _QUICK * count * NS:  # faster than they are made: a backlog is read off
+            self._row = 0
+        else:
+            self._late, self._row = [*self._late[1 - _LEVEL :], lag], self._row + 1
+        lowest = min(self._late, default=0.0)
+        agree = sum(each <= lowest + 64 + self._scatter() for each in self._late)
+        # a loss has a sharp floor, a backlog comes and goes; and who loses all the time is late all the time
+        lasted = after_ns - self._late_ns
+        if (agree < _SETTLED and self._row < _WINDOW and lasted < _DOUBT_NS) or lasted < _LASTING_NS or not lowest:
             return None
-        if self._lags[-1] < self._lags[0] - max(
-            allowed / 4, 0.02 * count
-        ):  # a backlog, on a link that is hardly faster
+        if self._late[-1] < self._late[0] - max(allowed / 4, 0.02 * count):  # read off on a link that is hardly faster
             return None
         return Lapse(round(lowest), self.total - self.sure_bytes)
 
@@ -139,10 +156,13 @@ class Pace:
 
     def _allowed(self, now_ns: int) -> float:
         """Lag that is no loss: scatter of the stamps, and what the rate may be off since the punctual moment."""
-        assert self._at is not None
-        known = len(self._jumps) >= 8
-        scatter = float(np.quantile(self._jumps, 0.9)) if known else self._rate * 200e-6
-        return 64 + 4 * scatter + self._drift * self._rate * (now_ns - self._at[0]) / NS
+        since_ns = self._at[0] if self._at else now_ns
+        return 64 + 6 * self._scatter() + self._drift * self._rate * (now_ns - since_ns) / NS
+
+    def _scatter(self) -> float:
+        """Bytes by which one block's stamp differs from the next one's."""
+        most = self._rate * _PUNCTUAL_NS / NS
+        return min(float(np.quantile(self._jumps, 0.75)), most) if len(self._jumps) >= 8 else most
 
     def _fit(self, lag: float, after_ns: int, in_time: bool) -> None:
         if in_time:

@@ -82,7 +82,7 @@ def measure(scene: str, blur_px: float, views: int, seed: int) -> list[Row]:
     """One scene at one blur, every arm: the same options, no second try for the single maps."""
     from spikerig.calib.mapping import Options, build_map
     from spikerig.calib.pictures import frame_picture
-    from spikerig.calib.poses import Wanted, best_kind, estimate_poses, look_at
+    from spikerig.calib.poses import Wanted, best_kind, estimate_poses, gain_of, look_at
     from spikerig.dataset.store import open_scene
     from spikerig.rigctl.sim.capture import capture
 
@@ -92,10 +92,11 @@ def measure(scene: str, blur_px: float, views: int, seed: int) -> list[Row]:
         with open_scene(path) as opened:
             seen, camera = [opened.view(n) for n in opened.names], opened.camera
     truth = {v.name: v.pose.cam_from_world for v in seen}
-    kind, options = best_kind(seen), Options(seed=seed)
+    gain, options = gain_of(seen), Options(seed=seed)
+    kind = best_kind(seen, gain)
     pictures = {
         "rgb": {v.name: frame_picture(v.frame) for v in seen},
-        "spike": {v.name: look_at(v, 0.5, kind) for v in seen},
+        "spike": {v.name: look_at(v, 0.5, kind, gain) for v in seen},
     }
     rows = []
     for arm, shown in pictures.items():

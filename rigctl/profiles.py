@@ -17,11 +17,11 @@ QSFP40 = 5.0e9  # 40 Gbit/s, the vendor's capture card
 
 # Where each certainty comes from is told in docs/hardware/vidar.md, which a test keeps equal to this table.
 _VIDAR: Mapping[str, Sure] = MappingProxyType({
-    "width": "documented", "height": "documented", "row_bits": "documented", "rate_hz": "documented",
+    "width": "documented", "height": "documented", "row_bits": "assumed", "rate_hz": "documented",
     "framing": "assumed", "bottom_up": "documented", "vendor": "assumed", "product": "assumed",
     "packet_bytes": "documented", "link_bytes_s": "documented",
 })  # fmt: skip
-_M1K40: Mapping[str, Sure] = MappingProxyType({**_VIDAR, "framing": "documented"})
+_M1K40: Mapping[str, Sure] = MappingProxyType({**_VIDAR, "row_bits": "documented", "framing": "documented"})
 
 
 def _vidar(rate: int, row_bits: int) -> WireProfile:

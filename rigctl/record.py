@@ -173,6 +173,8 @@ class Loop:
                 self.recorder.close()
         finally:
             state = self.recorder.state()
+            epoch, seen = self.recorder.position()
+            self._event({"host_ns": self.host.now_ns(), "kind": "end", "epoch": epoch, "bytes": seen})
             self.tally.bytes, self.tally.chunks = state.kept_bytes, state.chunks
             self.tally.high_water, self.tally.slots = state.high_water, state.slots
             self.tally.seconds = (self.host.now_ns() - self.began_ns) / NS
@@ -198,7 +200,9 @@ class Loop:
             self.operator.say(f"  {title}: {self._figures(view.checks)}")
             for line in amiss:
                 self.operator.say(f"  !! {line}")
-            if self._good_enough(amiss, tried):
+            if not view.spikes and self.plan.advance == "auto" and tried >= self.plan.tries:
+                raise DeviceError("the spike camera gives no bytes", value=name, next="mend it, then --resume")
+            if self._good_enough(amiss, tried, bool(view.spikes)):
                 break
             self.writer.view(replace(view, kept=False))
             self.tally.retaken += 1
@@ -223,12 +227,13 @@ class Loop:
                 raise Stopped
             return answer != SKIP
 
-    def _good_enough(self, amiss: list[str], tried: int) -> bool:
+    def _good_enough(self, amiss: list[str], tried: int, any_spikes: bool) -> bool:
         if self.plan.advance == "auto":
             return not amiss or tried >= self.plan.tries
         keys = {GO: "keep it", RETAKE: "take it again", QUIT: "end here, without it"}
         if amiss:
-            keys = {RETAKE: keys[RETAKE], GO: "keep it all the same", QUIT: keys[QUIT]}
+            keep = {GO: "keep it all the same"} if any_spikes else {}
+            keys = {RETAKE: keys[RETAKE], **keep, QUIT: keys[QUIT]}
         answer = self._ask("  keep?", keys)
         if answer == QUIT:
             raise Stopped
@@ -254,14 +259,12 @@ class Loop:
             spans = spans or self.recorder.pause()
             clip = self._rgb(lambda rgb: rgb.stop())
         trouble = self.recorder.state().trouble
-        if trouble and not spans:
-            raise DeviceError("the spike camera gives no bytes", value=trouble, next="mend it, then --resume")
-        if trouble and self.recorder.dead:
-            raise HostError("recording ended", value=trouble, next="mend it, then --resume")
-        short = round(self.plan.seconds * self.plan.profile.rate_hz)
-        short -= sum(b - a for _, a, b in spans) // self.plan.profile.tick_bytes
+        if self.recorder.dead:
+            raise DeviceError("recording ended", value=trouble, next="mend it, then --resume")
+        wanted = round(self.plan.seconds * self.plan.profile.rate_hz)
+        short = wanted - sum(b - a for _, a, b in spans) // self.plan.profile.tick_bytes
         told |= {
-            "lost_ticks": self._lost_ticks() - lost + (max(0, short) if trouble else 0),
+            "lost_ticks": max(self._lost_ticks() - lost, short),
             "sync_us": self.pulse.residual_us(),
             "free_bytes": shutil.disk_usage(self.writer.folder).free,
         }

@@ -76,7 +76,7 @@ def record(
     if told.cannot:
         raise UsageError("this plan cannot be recorded here", value="; ".join(r["what"] for r in told.cannot),
                          next=f"spikerig rig plan {plan} -o {out}")  # fmt: skip
-    rig = open_rig(read, emulate, out if resume else None)
+    rig = open_rig(read, out, emulate, resume)
     try:
         with rig.host.worker("main"):
             tally = run(read, rig, out, Person() if read.advance == "prompt" else Nobody(), resume=resume)

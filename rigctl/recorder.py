@@ -189,6 +189,10 @@ class Recorder:
             ring.slots, ring.high_water, self._lost_transport, self._lost_recorder, self._trouble,
         )  # fmt: skip
 
+    def position(self) -> tuple[int, int]:
+        """The epoch, and bytes that came of it."""
+        return self._epoch, self._next
+
     @property
     def dead(self) -> bool:
         """No byte will be read or written any more: the reader ended, or the disk failed."""

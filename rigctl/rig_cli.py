@@ -2,44 +2,37 @@
 
 from __future__ import annotations
 
-import tomllib
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from spikerig.dataset.clocktime import NS
-from spikerig.dataset.errors import DataError, RigError, UsageError
+from spikerig.dataset.errors import DataError, DeviceError, RigError, UsageError
 from spikerig.dataset.terminal import emit, note
 from spikerig.rigctl.devices import DeviceFacts
 from spikerig.rigctl.host import RealHost
 
-Emulate = Annotated[Path | None, typer.Option(help="A file of emulated devices in place of the real ones (TOML).")]
+Emulate = Annotated[str, typer.Option(help="An emulated rig in place of the real one: a file (TOML) or `demo`.")]
 Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
 Found = tuple[list[DeviceFacts], list[str]]
 
 
-def find(emulate: Emulate = None, as_json: Json = False) -> None:
+def find(emulate: Emulate = "", as_json: Json = False) -> None:
     """Look for the rig's devices: spike camera, RGB camera, clock box; each is found or the reason told.
 
     Exit codes: 0 all kinds found, 1 some are missing.
     """
-    bench = None if emulate is None else read_bench(emulate)
     told: dict[str, dict[str, Any]] = {}
-    for kind, search in FINDERS.items():
-        try:
-            facts, failed = search(bench)
-        except RigError as error:  # one kind that cannot be searched must not hide the others
-            facts, failed = [], [str(error).replace("\n", ";")]
-        devices = [
-            {"model": f.model, "serial": f.serial, "firmware": f.firmware, "address": f.address, **f.more}
-            for f in facts
-        ]
-        told[kind] = {"devices": devices, "reasons": failed or ([] if facts else ["none answered"])}
+    with bench_of(emulate) as bench:
+        for kind, search in FINDERS.items():
+            told[kind] = _ask(search, bench)
     missing = [kind for kind, found in told.items() if not found["devices"]]
     if as_json:
-        emit("spikerig.rig.find/1", {"emulated": emulate is not None, "kinds": told, "missing": missing})
+        emit("spikerig.rig.find/1", {"emulated": bool(emulate), "kinds": told, "missing": missing})
     for kind, found in told.items():
         for d in found["devices"]:
             note(f"{kind:>5}: {d['model']}, serial {d['serial'] or '(none)'}, {d['address']}, firmware {d['firmware']}")
@@ -49,10 +42,22 @@ def find(emulate: Emulate = None, as_json: Json = False) -> None:
         raise typer.Exit(1)
 
 
+def _ask(search: Callable[[Any], Found], bench: Any) -> dict[str, Any]:
+    """What one kind's search brought; a kind that cannot be searched must not hide the others."""
+    try:
+        facts, failed = search(bench)
+    except RigError as error:
+        facts, failed = [], [str(error).replace("\n", ";")]
+    devices = [
+        {"model": f.model, "serial": f.serial, "firmware": f.firmware, "address": f.address, **f.more} for f in facts
+    ]
+    return {"devices": devices, "reasons": failed or ([] if facts else ["none answered"])}
+
+
 def probe(
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Where the raw bytes are dumped.")] = None,
     file: Annotated[Path | None, typer.Option(help="Look at a dump in place of a camera.")] = None,
-    emulate: Emulate = None,
+    emulate: Emulate = "",
     profile: Annotated[str, typer.Option(help="Wire profile for the USB ids: a name or a TOML file.")] = "",
     serial: Annotated[str, typer.Option(help="Of the camera, or its address as `rig find` tells it.")] = "",
     megabytes: Annotated[float, typer.Option("--megabytes", help="How much to look at.")] = 16.0,
@@ -63,25 +68,26 @@ def probe(
 
     Exit codes: 0 one hypothesis convinces, 1 none does.
     """
+    from spikerig.dataset.outfile import refuse_existing, whole_file
     from spikerig.rigctl.probe import examine
     from spikerig.rigctl.profiles import DEFAULT, PROFILES, profile_named
 
-    if (file is not None) + (emulate is not None) > 1 or (file is not None and out is not None):
+    if file is not None and (emulate or out is not None):
         raise UsageError("a dump is looked at where it is", value=file, next="give --file alone")
     if not 0.1 <= megabytes <= 1024:
         raise UsageError("between 0.1 and 1024 MB can be looked at", value=megabytes)
-    bench = None if emulate is None else read_bench(emulate)
-    chosen = profile_named(profile) if profile else bench.profile if bench else PROFILES[DEFAULT]
     size = int(megabytes * 1e6)
-    if file is not None:
-        data, bytes_s = _from_file(file, size), None
-    else:
-        data, bytes_s = _from_camera(bench, chosen, serial, size)
-        if out is not None:
-            from spikerig.dataset.outfile import whole_file
-
-            with whole_file(out, force=force) as part:
-                part.write_bytes(data.tobytes())
+    with bench_of(emulate) as bench:
+        chosen = profile_named(profile) if profile else bench.profile if bench else PROFILES[DEFAULT]
+        if file is not None:
+            data, bytes_s = _from_file(file, size), None
+        else:
+            if out is not None:
+                refuse_existing(out, force)
+            data, bytes_s = _from_camera(bench, chosen, serial, size)
+    if out is not None:
+        with whole_file(out, force=force) as part:
+            part.write_bytes(data.tobytes())
     seen = examine(data, [chosen, *PROFILES.values()], bytes_s)
     best = seen.convincing
     document = {
@@ -123,7 +129,7 @@ def _from_camera(bench: Any, profile: Any, serial: str, size: int) -> tuple[Any,
     from spikerig.rigctl.vidar import VidarSource
 
     host = bench.host if bench else RealHost()
-    source = VidarSource(profile, host, bench.usb if bench else None, serial=serial)
+    source = VidarSource(profile, host, bench.usb if bench else None, serial=serial, patience_ns=10 * NS)
     try:
         source.start()
         kept: list[Any] = []
@@ -144,44 +150,46 @@ def _from_camera(bench: Any, profile: Any, serial: str, size: int) -> tuple[Any,
         source.close()
     data = np.concatenate(kept)[:size] if kept else np.zeros(0, np.uint8)
     if not len(data):
-        raise DataError("no bytes came", value=f"{source.facts.serial} at {source.facts.address}")
+        raise DeviceError("no bytes came", value=f"{source.facts.serial} at {source.facts.address}")
     return data, rate.bytes_s if rate else None
 
 
-class Bench:
-    """Emulated transports in place of the machine's."""
-
-    def __init__(self, table: dict[str, Any], where: str) -> None:
-        from spikerig.rigctl.sim.emulate.spike_bench import bridge_of
-        from spikerig.rigctl.sim.emulate.usb import EmulatedUsb
-        from spikerig.rigctl.sim.emulate.virtual import VirtualHost
-
-        self.host = VirtualHost()
-        bridges = [bridge_of(table["spike"], where=where)] if "spike" in table else []
-        self.usb = EmulatedUsb(self.host, bridges)
-        self.profile = bridges[0].wire.profile if bridges else None
-
-
-def read_bench(path: Path) -> Any:
-    """The emulated devices of a file.
+@contextmanager
+def bench_of(emulate: str) -> Iterator[Any]:
+    """The transports of an emulated rig, by its file or its name; None: this machine's own.
 
     Raises:
-        UsageError, DataError: there is no such file, or it is no TOML, or an entry is wrong.
+        UsageError: there is no such file, or an entry is wrong.
     """
+    if not emulate:
+        yield None
+        return
+    from spikerig.rigctl.sim.emulate.rig import load_rig_spec, transports_of
+
+    bench = transports_of(load_rig_spec(emulate))
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError("the file of emulated devices cannot be read", value=f"{path}: {error.strerror}") from error
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise DataError("the file of emulated devices is no TOML", value=path, cause=str(error)) from error
-    return Bench(table, str(path))
+        yield bench
+    finally:
+        shutil.rmtree(bench.card, ignore_errors=True)
 
 
 def _spike(bench: Any) -> Found:
     from spikerig.rigctl.vidar import find as search
 
-    return search(RealHost(), None) if bench is None else search(bench.host, bench.usb)
+    return search(RealHost()) if bench is None else search(bench.host, bench.usb, (bench.profile,))
+
+
+def _rgb(bench: Any) -> Found:
+    from spikerig.rigctl.gopro import find as search
+
+    return search(RealHost()) if bench is None else search(bench.host, bench.web, bench.radio)
+
+
+def _sync(bench: Any) -> Found:
+    from spikerig.rigctl.syncbox import find as search
+
+    return search(RealHost()) if bench is None else search(bench.host, bench.ports, bench.opener_of)
 
 
 # kind -> what looks for its devices: (bench or None) -> (found, a line for each that failed)
-FINDERS: dict[str, Callable[[Any], Found]] = {"spike": _spike}
+FINDERS: dict[str, Callable[[Any], Found]] = {"spike": _spike, "rgb": _rgb, "sync": _sync}

@@ -13,6 +13,7 @@ from typing import Any
 from spikerig.dataset.errors import RigError, UsageError
 from spikerig.dataset.segments import PAGE
 from spikerig.dataset.wire import WireProfile
+from spikerig.rigctl.panel_view import PanelPlan
 from spikerig.rigctl.profiles import DEFAULT, profile_named, profile_of
 from spikerig.rigctl.recorder import OnFull, RecorderOptions
 from spikerig.rigctl.sim.limits import Faults, limits, read_record
@@ -42,6 +43,8 @@ class Rgb:
 
     Args:
         use: there is one.
+        link: "ble": started and stopped over Bluetooth; "hand": a person presses its button.
+        camera: its Bluetooth name, where there are several.
         mbit_s: of its clips, for the estimate of bytes.
         card_gb: free on its card, as read from its screen; 0: not known before it is found.
         lead_s: before and after the spikes of a viewpoint the clip runs so much longer.
@@ -49,6 +52,8 @@ class Rgb:
     """
 
     use: bool = limits(True)
+    link: str = limits("ble", choices=("ble", "hand"))
+    camera: str = limits("")
     mbit_s: float = limits(60.0, 0.1, 1000, "Mbit/s")
     card_gb: float = limits(0.0, 0, 100_000, "GB")
     lead_s: float = limits(0.5, 0, 60, "s")
@@ -126,6 +131,7 @@ class _Top:
     sync: Any = limits({})
     checks: Any = limits({})
     recorder: Any = limits({})
+    panel: Any = limits(None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,6 +163,7 @@ class TakePlan:
     sync: Sync
     checks: Checks
     recorder: Keeping
+    panel: PanelPlan | None = None
 
     def as_json(self) -> dict[str, Any]:
         """The plan, whole, JSON-ready."""
@@ -206,7 +213,11 @@ def read_plan(table: Mapping[str, Any], source: str = "the plan") -> TakePlan:
         top.name, _names(top.viewpoints, faults), top.seconds, top.advance, top.settle_s, top.tries, top.test_every,
         _profile(spike, source, faults), spike, rgb, read_record(Sync, top.sync, "sync", faults), checks,
         read_record(Keeping, top.recorder, "recorder", faults),
+        None if top.panel is None else read_record(PanelPlan, top.panel, "panel", faults),
     )  # fmt: skip
+    panel = plan[-1]
+    if isinstance(panel, PanelPlan) and panel.bits is not None and panel.slow >= panel.bits:
+        faults.add("panel.slow", f"is {panel.slow}, expected below panel.bits, {panel.bits}")
     faults.raise_any()
     return TakePlan(*plan)  # pyright: ignore[reportArgumentType]  # without a profile there was a fault
 

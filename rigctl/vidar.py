@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ LEAST_BLOCK = 524_288
 _TRIES = 5  # transfers that may fail in a row before the device counts as gone
 _SILENCE_NS = NS  # without a byte: the stream is begun again
 _DRAIN_NS = NS  # at most, for what lay in the camera's memory
+_PUNCTUAL_NS = 200_000  # that a host may be late
 _BACKOFF_NS = (50_000_000, 100_000_000, 200_000_000, 500_000_000, NS)
 
 
@@ -68,11 +70,12 @@ class VidarSource:
         self._small = create_buffer(packet)
         self._views = [np.frombuffer(a, np.uint8) for a in self._arrays]
         self.pace = Pace(profile.bytes_s)
+        self._delayed: Callable[[], int] = getattr(host, "delayed_ns", lambda: 0)
         self.epoch = -1
         self._turn, self._index, self._streaming = 0, 0, False
         self._loss: tuple[int, str, int] = (0, "", 0)  # lost, why, suspect: for the next block to tell
         self._trouble, self._failed, self._silent = "", 0, False
-        self._heard_ns = self._retry = 0
+        self._heard_ns = self._retry = self._clear_ns = 0
 
     def start(self) -> None:
         """Begin the stream: flush, stream, throw old bytes away until they come at the camera's own pace."""
@@ -97,11 +100,11 @@ class VidarSource:
         while True:
             if self._device is None and not self._return(until):
                 return None
-            before = self._host.now_ns()
+            before, delayed = self._host.now_ns(), self._delayed()
             count = self._transfer(self._arrays[self._turn], until - before)
             after = self._host.now_ns()
             if count:
-                return self._block(count, before, after)
+                return self._block(count, before, after, min(self._delayed() - delayed, after - before))
             if after >= until:
                 return None
 
@@ -122,21 +125,22 @@ class VidarSource:
     @property
     def doubtful_bytes(self) -> int:
         """Bytes at the end of what was read that came late and have not been made up for; ask after `stop`."""
-        return self.pace.doubtful()
+        untold = self._loss[1] and not self._index  # a loss that the next block would have told
+        return self._loss[2] if untold else self.pace.doubtful()
 
     def measured_rate(self) -> Rate | None:
         """Bytes a second as they come, on the host's clock; None in the first half second."""
         return self.pace.measured()
 
     # -- the stream -------------------------------------------------------------------------------------------------
-    def _block(self, count: int, before: int, after: int) -> Block:
-        """Bytes that came, with what was lost before them."""
+    def _block(self, count: int, before: int, after: int, delay: int) -> Block:
+        """Bytes that came, with what was lost before them; of their time `delay` was the host's own."""
         self._failed, self._retry, self._heard_ns = 0, 0, after
         data = self._views[self._turn][:count]
         self._turn ^= 1
         block = Block(data, self.epoch, self._index, before, after, *self._loss)
         self._index, self._loss = self._index + count, (0, "", 0)
-        lapse = self.pace.add(before, after, count)
+        lapse = self.pace.add(before, after, count, delay)
         if lapse is not None:  # known from now on: this block still belongs to the old epoch, at its suspect end
             self._loss = (lapse.bytes, "rate", lapse.suspect)
             self.epoch, self._index = self.epoch + 1, 0
@@ -145,14 +149,14 @@ class VidarSource:
 
     def _new_epoch(self, why: str) -> None:
         """The stream runs again, and nothing waits: count from here; the next block tells what is missing."""
-        now = self._host.now_ns()
+        since = self._clear_ns
         lost, first, suspect = self._loss
-        lost += max(0, round(self.pace.lag(now, self.pace.total))) if why else 0
+        lost += max(0, round(self.pace.lag(since, self.pace.total))) if why else 0
         if self._index or not why:  # else the epoch before had not a single byte
             self.epoch, self._index = self.epoch + 1, 0
             suspect = self.pace.doubtful()
         self._loss = (lost, first or why, suspect)
-        self.pace.begin(now)
+        self.pace.begin(since)
 
     def _transfer(self, buffer: Any, left_ns: int) -> int:
         """One bulk read: how many bytes came. After an error the stream is caught up with, in a new epoch."""
@@ -210,6 +214,7 @@ class VidarSource:
         """
         end = self._host.now_ns() + _DRAIN_NS
         calm, came = 0, False
+        self._clear_ns = self._host.now_ns()
         while calm < 2 and self._host.now_ns() < end:
             before = self._host.now_ns()
             try:
@@ -219,8 +224,10 @@ class VidarSource:
                     raise
                 continue
             came = True
-            took = (self._host.now_ns() - before) / NS
-            calm = calm + 1 if count < 1.1 * took * self.profile.bytes_s else 0
+            late = self._host.now_ns() - before - round(count / self.profile.bytes_s * NS)
+            slack = max(_PUNCTUAL_NS, 0.1 * count / self.profile.bytes_s * NS)
+            calm = calm + 1 if abs(late) < slack else 0  # neither a backlog nor a host that let one grow
+            self._clear_ns = self._host.now_ns() - max(late, 0)
         return came
 
     def _send(self, commands: tuple[bytes, ...]) -> None:

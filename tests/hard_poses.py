@@ -38,6 +38,24 @@ ROWS = [
         POSES + "test_reasons",
     ),
     (
+        "a sensor without a fixed pattern, a dead pixel, fewer than eight views",
+        "fixed_pattern",
+        "none invented (sd under 0.2 %); within 25 %; None",
+        "calib/test_pattern.py::test_none_is_invented",
+    ),
+    (
+        "writing poses in place is interrupted, or the process is killed",
+        "write_poses",
+        "the scene is as it was, byte for byte",
+        "calib/test_posed_scene.py::test_a_killed_write_leaves_the_scene_as_it_was",
+    ),
+    (
+        "a board seen twice, from one direction, or moved between views",
+        "scale_of",
+        "no scale, and why",
+        "calib/test_scale.py::test_why_there_is_none",
+    ),
+    (
         "COLMAP ends its process",
         "mapping.run_child",
         "one HostError that names the signal",

@@ -1,4 +1,4 @@
-"""The train verbs: fit, render, score."""
+"""The train verbs: fit and render (score and quality have files of their own)."""
 
 from __future__ import annotations
 
@@ -95,50 +95,6 @@ def fit(
         emit("spikerig.train.fit/1", result)
 
 
-def score(
-    run: Annotated[Path, typer.Argument(help="Folder of a run.")],
-    scene: Annotated[Path | None, typer.Argument(help="Scene to score on; the run's own where not given.")] = None,
-    ssim: Annotated[str, typer.Option(help="SSIM variant: torchmetrics, tf, skimage, inria.")] = "torchmetrics",
-    pictures: Annotated[Path | None, typer.Option(help="Folder for the held-out renders, NAME.png.")] = None,
-    force: Force = False,
-    as_json: Json = False,
-) -> None:
-    """Score a run: PSNR, SSIM and luma PSNR of sharp held-out views, and of the training views' mid-exposure.
-
-    Scenes without truth are scored on their held-out frames as stored, and the result says so.
-    """
-    from spikerig.dataset.images import write_image
-    from spikerig.dataset.store import open_scene
-    from spikerig.train.record import open_run, scene_hash
-    from spikerig.train.score import score_run
-
-    opened = open_run(run)
-    path = opened.scene if scene is None else scene
-    if pictures is not None:
-        _picture_folder(pictures, force)
-    same = scene_hash(path) == opened.record["scene"]["sha256"] if path.exists() else True
-    if not same:
-        note(f"note: {path} is not the file this run was trained on")
-
-    def keep(name: str, picture: Any) -> None:
-        if pictures is not None:
-            write_image(pictures / f"{name}.png", picture, force=True)
-
-    with open_scene(path) as file:
-        result = score_run(opened.model, file, ssim=ssim, keep=keep)
-    result |= {"run": str(run), "scene": str(path), "scene_matches": same, "machine": opened.record["machine"]}
-    result |= {key: opened.record.get(key) for key in ("steps", "train_seconds")}
-    for label, key in (("novel view", "novel_view"), ("blur view", "blur_view")):
-        if (part := result[key]) is not None:
-            note(
-                f"{label}: PSNR {part['psnr']:.2f} dB, luma {part['luma_psnr']:.2f}, SSIM {part['ssim']:.4f} "
-                f"over {len(part['views'])} views, against {part['against']}"
-            )
-    note(f"method {result['method']}, pose label '{result['pose_label']}', SSIM {result['ssim_variant']}")
-    if as_json:
-        emit("spikerig.train.score/1", result)
-
-
 def render(
     run: Annotated[Path, typer.Argument(help="Folder of a run.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the pictures.")],
@@ -173,7 +129,7 @@ def render(
     if format not in ("png", "exr"):
         raise UsageError("no such picture format", value=format, expected="png or exr")
     opened = open_run(run)
-    _picture_folder(out, force)
+    picture_folder(out, force)
     with open_scene(opened.scene if scene is None else scene) as file:
         written = render_path(
             opened.model, file, path, out,
@@ -184,7 +140,8 @@ def render(
         emit("spikerig.train.render/1", {"run": str(run), "path": path, "folder": str(out), "pictures": written})
 
 
-def _picture_folder(folder: Path, force: bool) -> None:
+def picture_folder(folder: Path, force: bool) -> None:
+    """Make a folder for pictures; one that holds files is refused unless `force`."""
     if folder.is_dir() and any(folder.iterdir()) and not force:
         raise UsageError("the folder holds files", value=folder, next="--force writes into it")
     folder.mkdir(parents=True, exist_ok=True)

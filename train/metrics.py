@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.dataset.errors import UsageError
+from spikerig.dataset.errors import NumericsError, UsageError
 
 Picture = NDArray[np.float64]
 LUMA = np.array([0.299, 0.587, 0.114])  # Rec.601, on codes
@@ -32,7 +32,13 @@ def as_float(picture: NDArray) -> Picture:
 def _pair(a: NDArray, b: NDArray) -> tuple[Picture, Picture]:
     if a.shape != b.shape or a.ndim != 3 or a.shape[2] != 3:
         raise UsageError("pictures to compare are two [H,W,3] of one size", value=(a.shape, b.shape))
-    return as_float(a), as_float(b)
+    if a.size == 0:
+        raise UsageError("pictures to compare have no pixels", value=a.shape)
+    x, y = as_float(a), as_float(b)
+    bad = int((~np.isfinite(x)).sum() + (~np.isfinite(y)).sum())
+    if bad:
+        raise NumericsError("pictures to compare hold NaN or infinite values", value=f"{bad} values")
+    return x, y
 
 
 def _db(mse: float) -> float:

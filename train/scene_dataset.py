@@ -101,7 +101,7 @@ class SceneDataset(Dataset[dict[str, Any]]):
             "valid": torch.from_numpy(np.array(view.valid)),
             "K": torch.tensor(scene.camera.K, dtype=torch.float32),
             "cam_from_world": torch.tensor(view.pose.cam_from_world, dtype=torch.float32),
-            "at_ns": torch.tensor([round(t) for t in at_ns]),
+            "at_ns": torch.tensor(at_ns),
         }
         if view.trajectory is not None or len(self.phases) == 1:
             poses = np.stack([sub_pose(view, phase) for phase in self.phases])
@@ -121,6 +121,6 @@ class SceneDataset(Dataset[dict[str, Any]]):
                 value=f"{self.path}: {view.name}, {view.frame.row_ns} ns a row",
                 next="align the take first",
             )
-        ticks = [view.spikes.tick_at(round(t)) for t in at_ns]
+        ticks = [view.spikes.tick_at(t) for t in at_ns]
         made = [self.straight.texture(TEXTURES[name](view.spikes, tick, self.window)) for tick in ticks]
         return np.stack([t.light for t in made]), np.stack([t.known for t in made])

@@ -5,7 +5,7 @@ import panel_worlds as worlds
 import pytest
 
 from spikerig.calib.clock import fit_rig
-from spikerig.calib.panel_frames import read_frames
+from spikerig.calib.panel_frames import _edge, read_frames
 from spikerig.calib.panel_read import Spot, read_spikes
 from spikerig.dataset.clocktime import NS
 from spikerig.dataset.errors import DataError, UsageError
@@ -55,6 +55,20 @@ def test_lost_ticks_are_not_read_as_dark(looked):
     assert np.abs(error).max() < 25_000
     worse, _ = off(read_spikes(SpikeStream(bits, stream.width, stream.rate_hz, 77), panel, places, ahead_ns=BASE))
     assert np.abs(worse).max() > np.abs(error).max()
+
+
+def test_an_edge_whose_ticks_were_lost_makes_no_mark(looked):
+    panel, places, stream = looked
+    rate = NS / 40_000
+    edges = panel.edges(int(ahead(77)) + 20_000_000, int(ahead(77)) + 130_000_000, [9])
+    assert len(edges.at_ns) == 1  # bit 9 toggles every 102.4 ms
+    tick = round((int(edges.at_ns[0]) - BASE - 77) / (1 + 30e-6) / rate)
+    bits = stream.bits.copy()
+    bits[tick + 5 : tick + 25] = 0
+    holes = SpikeStream(bits, stream.width, stream.rate_hz, 77, "spike", np.array([[tick + 5, tick + 25]]))
+    found = {(s.led, s.rising) for s in read_spikes(holes, panel, places, ahead_ns=BASE)}
+    whole = {(s.led, s.rising) for s in read_spikes(stream, panel, places, ahead_ns=BASE)}
+    assert (9, bool(edges.rising[0])) in whole - found
 
 
 def test_a_dim_panel_at_20_khz():
@@ -163,3 +177,17 @@ def test_an_led_that_failed_makes_no_false_time():
     error, _ = off(read_frames(broken(), panel, places, ROW_NS, ahead_ns=BASE))
     assert np.median(np.abs(error)) < 12_000
     assert (np.abs(error) < 50_000).mean() > 0.6  # the other row still reads; what is wrong is by whole steps
+
+
+def test_words_that_are_no_neighbours_are_misread():
+    bit, word = np.arange(3), 3_200_000
+
+    def edge(n, turning, near=0):
+        code = (n >> bit & 1).astype(float)
+        code[turning] = 0.5
+        return _edge(code, bit == turning, bit, word, near)
+
+    assert edge(0b000, 0) == (1 * word, True)  # 0 -> 1
+    assert edge(0b010, 0) == (3 * word, False)  # 011 is 2, 010 is 3
+    assert edge(0b000, 1) is None  # 000 is 0, 010 is 3
+    assert edge(0b000, 2, 102 * word) == (104 * word, False)  # the wrap, the turn nearest to 102

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from spikerig.calib.mapping import Options, build_map, colmap_camera, run_child
-from spikerig.calib.pictures import looks, picture_of, texture_of
+from spikerig.calib.pictures import Looks, looks, picture_of, texture_of
 from spikerig.calib.poses import quaternion, rig_config
 from spikerig.dataset.errors import HostError, UsageError
 from spikerig.dataset.scene import Camera
@@ -30,10 +30,37 @@ def test_noise_is_measured_beside_edges(noise: float) -> None:
     assert looks([checks(noise, 0)], "x").noise == pytest.approx(noise, abs=0.3 + 0.15 * noise)
 
 
+def blobs(shift: float, noise: float, soft: float, seed: int) -> np.ndarray:
+    """Sixty spots of two sizes, moved by a shift, with noise of their own."""
+    y, x = np.mgrid[:120, :160]
+    p, rng = np.full((120, 160), 100.0), np.random.default_rng(5)
+    for _ in range(60):
+        cx, cy, wide = rng.uniform(8, 150), rng.uniform(8, 112), rng.uniform(1.5, 3)
+        spread = wide**2 + soft**2
+        p += rng.choice([-90, 90]) * wide**2 / spread * np.exp(-((x - cx - shift) ** 2 + (y - cy) ** 2) / 2 / spread)
+    return np.clip(np.rint(p + noise * np.random.default_rng(seed).normal(size=p.shape)), 0, 255).astype(np.uint8)
+
+
 def test_sharper_and_cleaner_scores_higher() -> None:
-    sharp, soft, noisy = (looks([checks(*a)], "x") for a in ((2.0, 0), (2.0, 12), (8.0, 0)))
-    assert sharp.score > 1.3 * soft.score
+    """Features that are found again, and near their place: fewer on soft pictures, and on noisy ones."""
+
+    def look(noise: float, soft: float) -> Looks:
+        pair = blobs(0.0, noise, soft, 1), blobs(2.5, noise, soft, 2)
+        return looks(pair, "x", [pair])
+
+    sharp, soft, noisy = look(1.0, 0.0), look(1.0, 6.0), look(16.0, 0.0)
+    assert sharp.refound > 30
+    assert sharp.spread < 0.15
+    assert sharp.score > 1.5 * soft.score
     assert sharp.score > 2 * noisy.score
+    assert sharp.sharpness > 1.3 * soft.sharpness
+
+
+def test_nothing_is_found_again_where_nothing_is() -> None:
+    flat = np.full((60, 80), 90, np.uint8)
+    assert looks([flat], "x", [(flat, flat)]).score == 0
+    other = np.random.default_rng(1).integers(0, 255, (120, 160)).astype(np.uint8)
+    assert looks([flat], "x", [(blobs(0, 0, 0, 1), other)]).score < 0.3 * looks([flat], "x", [(other, other)]).score
 
 
 def test_pictures_of_textures() -> None:

@@ -46,6 +46,8 @@ def test_poses_are_found_on_spikes_and_written(scene: Path, tmp_path: Path, caps
     assert told["registered"] == told["images"] == 8
     assert told["agreement"] == {**told["agreement"], "maps": 2, "agree": 2}
     assert told["truth"]["deg"]["median"] < 0.5
+    assert set(told["residual_px"]) == set(told["observations"])
+    assert np.median(list(told["residual_px"].values())) == pytest.approx(told["error_px"], rel=0.5)
     assert told["truth"]["share_of_extent"]["median"] < 0.01
     assert json.loads((out / "poses.json").read_text())["accepted"]
     assert (out / "colmap" / "sparse" / "0" / "images.txt").exists()

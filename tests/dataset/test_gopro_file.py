@@ -3,17 +3,19 @@
 import json
 import struct
 
+import av
 import numpy as np
 import pytest
 from gopro_clips import clip, grey
 
-from spikerig.dataset import cli
+from spikerig.dataset import cli, gopro_pictures
 from spikerig.dataset.errors import DataError, RigError, UsageError
 from spikerig.dataset.gopro_file import chapters, open_gopro
 from spikerig.dataset.gopro_pictures import read_pictures
-from spikerig.dataset.gopro_times import nearest
+from spikerig.dataset.gopro_times import nearest, through
 from spikerig.dataset.gpmf import header, items, streams, value
-from spikerig.rigctl.sim.emulate.gpmf_write import box, item, nest
+from spikerig.dataset.mp4_boxes import read_movie, read_samples
+from spikerig.rigctl.sim.emulate.gpmf_write import box, item, nest, telemetry_track
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +45,7 @@ def test_the_real_clips_frames_lie_on_its_stamps(shared_data):
     assert read.time_source == "CORI"
     assert read.start_ns[[0, 30, 60]].tolist() == [85_608_000, 1_086_608_000, 2_087_608_000]
     assert np.ptp(np.diff(read.start_ns)) <= 1
-    assert read.streams["ACCL"].values.mean(0) == pytest.approx([0, -9.8, 0], abs=3)
+    assert read.streams["ACCL"].values[0] == pytest.approx([8.61630695, 0.47482014, 1.61870504])  # gpmf-parser's
     assert read.row_ns == pytest.approx(20.600767e6 / 480)
 
 
@@ -75,6 +77,13 @@ def test_an_emulated_clips_times_are_the_true_ones_on_its_clock(plain):
     assert (read.model, read.settings["EISE"], read.settings["VFPS"]) == ("HERO9 Black", "N", [120000, 1001])
 
 
+def test_streams_of_one_sample_a_frame_have_the_frames_times(plain):
+    read = open_gopro(plain[0])
+    for key in ("CORI", "SHUT", "ISOE", "MSKP"):
+        assert np.array_equal(read.streams[key].at_ns[:150], read.start_ns)
+    assert len(read.streams["CORI"].values) == 151  # one stamp more than frames, as in the real clip
+
+
 def test_pictures_show_what_was_there_at_their_time(plain):
     path, take = plain
     read = open_gopro(path)
@@ -87,6 +96,36 @@ def test_each_frame_has_its_own_exposure(tmp_path):
     told = np.linspace(1 / 2000, 1 / 240, 150)
     paths, _ = clip(tmp_path, exposure_s=told)
     assert open_gopro(paths[0]).exposure_ns / 1e9 == pytest.approx(told, rel=1e-6)
+
+
+def test_exposures_of_a_payload_that_is_missing_are_the_nearest(tmp_path):
+    told = np.linspace(1 / 2000, 1 / 240, 150)
+    (path, *_), _ = clip(tmp_path, exposure_s=told)
+    raw = path.read_bytes()
+    path.write_bytes(raw.replace(b"SHUTf\x04\x00\x78", b"SHUXf\x04\x00\x78"))
+    seconds = open_gopro(path).exposure_ns / 1e9
+    assert seconds[120:] == pytest.approx(told[120:], rel=1e-6)
+    assert seconds[:120] == pytest.approx(np.full(120, told[120]), rel=1e-6)
+
+
+def test_without_stamps_of_frames_exposures_go_by_number(tmp_path):
+    told = np.linspace(1 / 2000, 1 / 240, 150)
+    (path, *_), _ = clip(tmp_path, exposure_s=told, spare=0)
+    path.write_bytes(path.read_bytes().replace(b"CORIs", b"CORXs"))
+    read = open_gopro(path)
+    assert read.time_source == "pts"
+    assert any("CORI" in r for r in read.remarks)
+    assert read.exposure_ns / 1e9 == pytest.approx(told, rel=1e-6)
+
+
+def test_times_bend_at_each_stamp():
+    knots, stamps = np.array([0.0, 10, 30]), np.array([1000.0, 1100, 1320])
+    at = through("CORI", knots, stamps, np.array([0.0, 5, 10, 20, 30, 40]), 10.0)
+    assert at.tolist() == [1000, 1050, 1100, 1210, 1320, 1430]
+    with pytest.raises(DataError, match="contradict"):
+        through("CORI", knots, stamps, knots, 4.0)
+    with pytest.raises(DataError, match="contradict"):
+        through("ACCL", knots, stamps[::-1], knots, 10.0, strict=False)
 
 
 def test_chapters_are_joined_without_a_seam(tmp_path):
@@ -177,8 +216,9 @@ HOSTILE = {
     "runs of another count": lambda raw: spoiled(raw, b"stts", number(8, 3)),
     "no such chunk": lambda raw: spoiled(raw, b"stsc", number(8, 7)),
     "chunks of 2^31": lambda raw: spoiled(raw, b"stsc", number(12, 1 << 31)),
-    "offset beyond the end": lambda raw: spoiled(raw, b"co64", number(8, 1 << 40, 8)),
-    "offset of 2^64 - 1": lambda raw: spoiled(raw, b"co64", number(8, 2**64 - 1, 8)),
+    "offset beyond the end": lambda raw: spoiled(raw, b"stco", number(8, 1 << 31)),
+    "long offset beyond the end": lambda raw: long_offset(raw, 1 << 40),
+    "long offset of 2^64 - 1": lambda raw: long_offset(raw, 2**64 - 1),
     "timescale 0": lambda raw: spoiled(raw, b"mdhd", number(12, 0)),
     "nested 10,000 deep": lambda raw: raw[: raw.rfind(b"moov") - 4] + deep(10_000),
     "100,000 tiny boxes": lambda raw: raw[: raw.rfind(b"moov") - 4] + box("moov", box("free") * 100_000),
@@ -193,6 +233,20 @@ HOSTILE = {
     "stamp of a million years": lambda raw: raw.replace(b"STMPJ\x08\x00\x01\0\0", b"STMPJ\x08\x00\x01\x7f\xff"),
     "stamps that step back": lambda raw: raw.replace(struct.pack(">Q", 85_608), struct.pack(">Q", 9_085_608)),
 }  # fmt: skip
+
+
+CAUSES = {  # words of the cause, where another check would refuse the file too, later
+    "empty": "empty", "cut in moov": "cut off", "moov missing": "no moov", "box larger than its parent": "claims",
+    "nested 10,000 deep": "deeper than", "100,000 tiny boxes": "more than 20000 boxes", "two moov": "two moov",
+    "offset beyond the end": "beyond the end of the file", "long offset beyond the end": "beyond the end of the file",
+    "moov of 3 GB": "claims", "2^32 samples": "samples", "chunks of 2^31": "chunk", "timescale 0": "0 units",
+    "telemetry claims too much": "SHUT", "scale 0": "SCAL", "stamps that step back": "CORI",
+}  # fmt: skip
+
+
+def long_offset(raw, offset):
+    """A track with one telemetry sample at a 64-bit offset, in place of all others."""
+    return raw[: raw.rfind(b"moov") - 4] + box("moov", telemetry_track(1, [8], [offset], [1001], 1000))
 
 
 def deep(levels):
@@ -213,6 +267,46 @@ def test_a_hostile_file_is_one_clear_error(name, plain, tmp_path):
         open_gopro(path)
     assert "bad.mp4" in str(told.value)
     assert told.value.cause
+    assert CAUSES.get(name, "") in told.value.cause
+
+
+def samples_agree(path):
+    """Offsets and sizes of the pictures are those that FFmpeg finds."""
+    track = next(t for t in read_movie(path).tracks if t.handler == "vide")
+    with av.open(str(path)) as container:
+        found = [(p.pos, p.size, p.pts) for p in container.demux(video=0) if p.size]
+    first = found[0][2]
+    assert [f[:2] for f in found] == list(zip(track.offsets.tolist(), track.sizes.tolist(), strict=True))
+    assert [f[2] - first for f in found] == (track.pts - track.pts[0]).tolist()
+
+
+def test_samples_lie_where_ffmpeg_finds_them(plain):
+    samples_agree(plain[0])
+
+
+@pytest.mark.real
+def test_samples_of_the_real_clip_lie_where_ffmpeg_finds_them(shared_data):
+    samples_agree(shared_data("gopro/max-heromode.mp4"))
+
+
+def test_a_far_picture_is_reached_from_the_key_frame_before_it(tmp_path, monkeypatch):
+    paths, _ = clip(tmp_path, frames=400)
+    seen = []
+    true = gopro_pictures._number
+    monkeypatch.setattr(gopro_pictures, "_number", lambda *a: seen.append(true(*a)) or seen[-1])
+    assert [n for n, _ in read_pictures(open_gopro(paths), [3, 390])] == [3, 390]
+    assert len(seen) < 40
+
+
+def test_long_offsets_are_read(tmp_path):
+    path = tmp_path / "long.mp4"
+    with path.open("wb") as file:  # sparse: the sample lies beyond 4 GB, moov behind it
+        file.write(struct.pack(">I4s", 20, b"ftyp") + b"mp41" + bytes(8))
+        file.write(struct.pack(">I4sQ", 1, b"mdat", (5 << 30) - 20))
+        file.seek((5 << 30) - 8)
+        file.write(b"payloads" + box("moov", telemetry_track(1, [8], [(5 << 30) - 8], [1001], 1000)))
+    movie = read_movie(path)
+    assert list(read_samples(path, movie.tracks[0])) == [b"payloads"]
 
 
 def test_zero_box_at_the_end_of_the_file_is_allowed(plain, tmp_path):

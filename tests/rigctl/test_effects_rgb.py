@@ -294,8 +294,10 @@ def test_deep_pixels() -> None:
     light = still(textured(65, 67))
     with pytest.raises(UsageError, match="8 bits"):
         run(light, BitDepth(10), Jpeg())
-    deep, bare = run(light, BitDepth(10), VideoCodec("hevc", 1000.0, 30.0, 0)).frame, run(light, BitDepth(10)).frame
+    codec = VideoCodec("hevc", 1000.0, 30.0, 0)
+    deep, bare = run(light, BitDepth(10), codec).frame, run(light, BitDepth(10)).frame
     assert deep.pixels.dtype == np.uint16
+    assert all(np.array_equal(codec.through(bare.pixels), deep.pixels) for _ in range(6))
     assert psnr(deep.pixels / 257, bare.pixels / 257) > 30
 
 

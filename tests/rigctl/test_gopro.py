@@ -1,19 +1,23 @@
 """The GoPro driver against the emulated camera: settled, recorded, fetched, verified; and all that goes wrong."""
 
+import sys
+
 import numpy as np
 import pytest
 from gopro_clips import clip as write
 from gopro_clips import grey, pictures
 
-from spikerig.dataset.errors import DeviceError, UsageError
+from spikerig.dataset.errors import DeviceError, HostError, UsageError
 from spikerig.dataset.gopro_file import open_gopro
 from spikerig.dataset.gopro_pictures import read_pictures
 from spikerig.rigctl import gopro_ble as ble
 from spikerig.rigctl.gopro import GoProSource, find
+from spikerig.rigctl.gopro import open_gopro as open_camera
 from spikerig.rigctl.gopro_check import verify_clip
 from spikerig.rigctl.gopro_http import Dark, Web
 from spikerig.rigctl.gopro_radio import Radio
 from spikerig.rigctl.gopro_settings import DEFAULTS
+from spikerig.rigctl.host import RealHost
 from spikerig.rigctl.sim.emulate import gopro_menu
 from spikerig.rigctl.sim.emulate.gopro_air import Air
 from spikerig.rigctl.sim.emulate.gopro_camera import Faults, GoProCamera, Nature
@@ -255,6 +259,15 @@ def test_a_lost_answer_to_the_shutter_is_decided_by_the_state(tmp_path, which):
     wait(source, 1)
     source.stop()
     assert len(camera.truth) == 1
+    assert source.radio.dial.__self__.shutters == 2  # pressed once each, not again
+
+
+def test_stop_waits_until_it_is_idle_though_http_is_back_before(tmp_path):
+    source, camera = rig(tmp_path, nature=Nature(stop_ms=(1500, 1600), back_ms=(-1450, -1400)))
+    source.start()
+    wait(source, 1)
+    source.stop()
+    assert not camera.busy
 
 
 def test_a_link_that_breaks_while_it_records_is_mended(tmp_path):
@@ -348,6 +361,30 @@ def test_a_camera_that_just_woke_is_waited_for(tmp_path):
     assert (source.facts.kind, source.facts.model, source.facts.serial) == ("rgb", "HERO9 Black", "C3441325000001")
 
 
+@pytest.mark.parametrize(
+    ("faults", "asleep", "link", "reasons"),
+    [({}, False, "ble", 0), ({"dials_fail": 9}, False, "hand", 1), ({"dials_fail": 9}, True, None, 2)],
+)
+def test_it_is_found_one_way_or_another_or_the_reasons_are_told(tmp_path, faults, asleep, link, reasons):
+    host = VirtualHost()
+    camera = GoProCamera(host, tmp_path, pictures(), faults=Faults(**faults))
+    camera.asleep = asleep
+    facts, why = find(host, Web(AirWifi(WebServer(camera)), host), Radio(Air(camera).dial, host, tries=1))
+    assert [f.more["link"] for f in facts] == ([link] if link else [])
+    assert len(why) == reasons
+    assert not camera.changed  # no link is left open
+
+
+def test_a_real_camera_is_connected_to_by_ble_or_by_hand(monkeypatch):
+    monkeypatch.setitem(sys.modules, "bleak", None)
+    with pytest.raises(HostError, match="bleak"):
+        open_camera(RealHost())
+    with pytest.raises(UsageError):
+        open_camera(RealHost(), link="usb")
+    with pytest.raises(Dark):
+        open_camera(RealHost(), link="hand", address="127.0.0.1:9")
+
+
 # ---- without Bluetooth ----------------------------------------------------------------------------------------------
 
 
@@ -379,7 +416,6 @@ def test_by_hand_the_start_is_seen_by_http_going_dark(tmp_path, hangs):
     assert clip.stop_ns[0] < truth["true_ns"][-1] + 3 * S
     read = open_gopro(source.fetch(clip, tmp_path))
     assert verify_clip(DEFAULTS, read) == []
-    assert find(source.host, source.web)[0].more["link"] == "hand"
 
 
 def test_by_hand_nobody_comes(tmp_path):

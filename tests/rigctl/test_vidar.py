@@ -106,7 +106,7 @@ def test_a_silent_loss_is_seen_from_the_time_and_its_place_is_bounded():
     assert abs(new.lost_bytes - 5000) < 200
     assert gaps(blocks) == ([], [5000], [0])
     assert losses(bridge)["drop"] == 5000
-    assert new.suspect_bytes <= 8 * 2_097_152
+    assert new.suspect_bytes <= 0.13 * K20.bytes_s
 
 
 def test_a_late_host_without_memory_in_the_camera_loses_and_knows():
@@ -131,12 +131,12 @@ def test_memory_in_the_camera_bridges_a_late_host():
 class BusyHost(VirtualHost):
     """A host that wakes late: by some hundred microseconds, and now and then by tens of milliseconds."""
 
-    def __init__(self, seed):
+    def __init__(self, seed, share=0.05):
         super().__init__()
-        self.rng = np.random.default_rng(seed)
+        self.rng, self.share = np.random.default_rng(seed), share
 
     def sleep_until(self, at_ns):
-        late = self.rng.exponential(2e5) + (self.rng.random() < 0.05) * self.rng.exponential(2e7)
+        late = self.rng.exponential(2e5) + (self.rng.random() < self.share) * self.rng.exponential(2e7)
         super().sleep_until(at_ns + round(late))
 
 
@@ -149,6 +149,14 @@ def test_a_busy_host_sees_no_loss_where_there_is_none(seed):
     assert abs(source.measured_rate().ppm - 30.0) < 5 * max(1, source.measured_rate().sigma_bytes_s / MID.bytes_s * 1e6)
 
 
+def test_a_host_that_is_often_behind_reads_its_backlog_off_and_sees_no_loss():
+    for seed in range(4):
+        host, _, bridge, source = opened(host=BusyHost(seed, 0.3), ram_bytes=32_000_000)
+        blocks = record(host, source, 8.0)
+        assert "overflow" not in losses(bridge)
+        assert epochs(blocks) == []
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_a_busy_host_misses_no_loss_of_some_milliseconds(seed):
     faults = [{"kind": "drop", "at_s": 2.0 + k, "bytes": 200_000} for k in range(6)]
@@ -157,8 +165,9 @@ def test_a_busy_host_misses_no_loss_of_some_milliseconds(seed):
     inside, suspect, _ = gaps(blocks, tail=source.doubtful_bytes)
     assert inside == []
     assert suspect == [200_000] * 6
-    assert [b.lost_why for b in epochs(blocks)] == ["rate"] * 6
-    assert all(abs(b.lost_bytes - 200_000) < 20_000 for b in epochs(blocks))
+    assert {b.lost_why for b in epochs(blocks)} == {"rate"}
+    assert 6 <= len(epochs(blocks)) <= 8  # a loss may be told in two parts
+    assert abs(sum(b.lost_bytes for b in epochs(blocks)) - 1_200_000) < 100_000
 
 
 def test_a_loss_in_the_last_blocks_is_doubted_at_the_end():
@@ -171,6 +180,16 @@ def test_a_loss_in_the_last_blocks_is_doubted_at_the_end():
     inside, suspect, _ = gaps([*blocks, (last, last.data)], tail=source.doubtful_bytes)
     assert inside == []
     assert len(suspect) == 1
+
+
+def test_a_loss_that_no_block_tells_any_more_is_doubted_at_the_end():
+    host, _, _, source = opened(faults=[{"kind": "drop", "at_s": 1.0, "bytes": 5000}])
+    blocks = record(host, source, 0.9)
+    while source.epoch == 0:
+        block = source.read(100 * MS)
+        blocks.append((block, block.data.copy()))
+    source.stop()
+    assert gaps(blocks, tail=source.doubtful_bytes) == ([], [5000], [])
 
 
 @pytest.mark.parametrize("seed", range(12))

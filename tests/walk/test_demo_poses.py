@@ -37,7 +37,7 @@ def scene_file(folder: Path) -> Path:
 def walked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any], dict[str, Any]]:
     """(folder, what each step said, the report) of the whole road, run as its command lines are."""
     out = tmp_path_factory.mktemp("road")
-    plan = posed_steps(out, (1.0, 40), 3, scene=str(scene_file(out)), boards=8, methods=("spike-ratio",))
+    plan = posed_steps(out, (1.0, 40), 3, scene=str(scene_file(out)), boards=8, methods=("spikenerf",))
     done = {step.key: {"seconds": 0.0, "said": demo.run_step(step)} for step in plan}
     return out, done, report.build(out, plan, done)
 
@@ -45,7 +45,7 @@ def walked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, An
 def test_the_price_of_calibration_and_poses_is_told(walked: tuple[Path, dict, dict]) -> None:
     out, _, told = walked
     cost = told["estimated"]
-    row = cost["methods"]["spike-ratio"]
+    row = cost["methods"]["spikenerf"]
     assert row["cost_db"] == pytest.approx(row["true_db"] - row["posed_db"])
     assert row["cost_with_points_db"] == pytest.approx(row["true_db"] - row["colmap_db"])
     assert cost["cost_db"]["mean"] == cost["cost_db"]["worst"] == row["cost_db"]
@@ -63,7 +63,7 @@ def test_the_price_of_calibration_and_poses_is_told(walked: tuple[Path, dict, di
 def test_both_roads_meet_the_same_pictures(walked: tuple[Path, dict, dict]) -> None:
     """Scored against the very same pixels, at poses of which the estimate moved none."""
     out, done, _ = walked
-    truths = {done[f"{s}-spike-ratio-score"]["said"]["novel_view"]["truth_sha256"] for s in ("true", "posed", "colmap")}
+    truths = {done[f"{s}-spikenerf-score"]["said"]["novel_view"]["truth_sha256"] for s in ("true", "posed", "colmap")}
     assert len(truths) == 1
     with open_scene(out / "true.h5") as true, open_scene(out / "colmap.h5") as found:
         assert true.test == found.test == ("004",)

@@ -121,7 +121,9 @@ def _coded(codec: str, pair: tuple[NDArray[Any], NDArray[Any]], qp: int) -> tupl
     encoder = av.CodecContext.create("libx264" if codec == "h264" else "libx265", "w")
     encoder.height, encoder.width = pair[0].shape[:2]
     encoder.pix_fmt, encoder.framerate, encoder.time_base = inside, 30, _fraction(1, 30)
-    encoder.thread_count = 1  # one thread: the same bits on every run
+    # One thread for all of it, the same bits on every run: threads that convert slices of a picture spill over the rows
+    # of others where the width is not a multiple of 16.
+    encoder.thread_count = 1
     if codec == "h264":
         encoder.options = {"preset": "veryfast", "qp": str(qp), "bf": "0", "x264-params": "scenecut=0:keyint=1000"}
     else:
@@ -131,12 +133,12 @@ def _coded(codec: str, pair: tuple[NDArray[Any], NDArray[Any]], qp: int) -> tupl
     decoder.thread_count = 1
     packets = []
     for k, pixels in enumerate(pair):
-        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format=kind).reformat(format=inside)
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format=kind).reformat(format=inside, threads=1)
         frame.pts = k
         packets += encoder.encode(frame)
     packets += encoder.encode(None)
     frames = [frame for packet in packets for frame in decoder.decode(packet)] + decoder.decode(None)
-    return frames[-1].to_ndarray(format=kind), [packet.size for packet in packets]
+    return frames[-1].to_ndarray(format=kind, threads=1), [packet.size for packet in packets]
 
 
 def _fraction(a: int, b: int) -> Any:

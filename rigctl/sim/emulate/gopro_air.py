@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 from dataclasses import dataclass, field
 
-from spikerig.dataset.clocktime import NS
 from spikerig.rigctl.gopro_radio import LinkLost
 from spikerig.rigctl.sim.emulate.gopro_camera import MS, GoProCamera
 from spikerig.rigctl.sim.emulate.latency import Latency
@@ -100,7 +99,8 @@ class AirLink:
             self.camera.changed.remove(self._push)
 
     def _breaks(self) -> list[int]:
-        return [round(t * NS) for t in self.camera.faults.link_lost_s if t * NS > self.opened_ns]
+        times = [self.camera.since(t) for t in self.camera.faults.link_lost_s]
+        return [t for t in times if t > self.opened_ns]
 
     def _alive(self) -> None:
         self.camera.advance()

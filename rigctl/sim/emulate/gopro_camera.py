@@ -56,7 +56,7 @@ class Nature:
 
 @dataclass(frozen=True)
 class Faults:
-    """What goes wrong, as data. Times are seconds of the host's clock, counted from 0.
+    """What goes wrong, as data. Times are seconds since the camera was made.
 
     Args:
         dials_fail: so many first attempts to connect.
@@ -119,6 +119,7 @@ class GoProCamera:
 
     def __post_init__(self) -> None:
         self.rng = stream(self.seed, "gopro")
+        self.made_ns = self.host.now_ns()
         self.lock = threading.RLock()
         self.settings = dict(menu.FACTORY)
         self.asleep = self.turbo = self.busy = self.encoding = False
@@ -134,7 +135,7 @@ class GoProCamera:
         for status, at_s in ((_FULL, self.faults.card_full_s), (_FLAT, self.faults.battery_flat_s),
                              (_HOT, self.faults.too_hot_s)):  # fmt: skip
             if at_s is not None:
-                self.at(round(at_s * NS), lambda s=status: self._fail(s))
+                self.at(self.since(at_s), lambda s=status: self._fail(s))
 
     # ---- time -------------------------------------------------------------------------------------------------------
 
@@ -142,6 +143,10 @@ class GoProCamera:
         """Have something happen."""
         self._count += 1
         heapq.heappush(self._due, (int(when_ns), self._count, what))
+
+    def since(self, seconds: float) -> int:
+        """Host time so long after the camera was made."""
+        return self.made_ns + round(seconds * NS)
 
     def advance(self) -> None:
         """Let happen what is due by now."""
@@ -183,13 +188,13 @@ class GoProCamera:
     def full(self) -> bool:
         """The card has no space."""
         at = self.faults.card_full_s
-        return at is not None and self.now_ns >= at * NS
+        return at is not None and self.now_ns >= self.since(at)
 
     def statuses(self) -> dict[int, int | str]:
         """Documented statuses by id."""
         now, faults = self.now_ns, self.faults
-        hot = faults.too_hot_s is not None and now >= faults.too_hot_s * NS
-        flat = faults.battery_flat_s is not None and now >= faults.battery_flat_s * NS
+        hot = faults.too_hot_s is not None and now >= self.since(faults.too_hot_s)
+        flat = faults.battery_flat_s is not None and now >= self.since(faults.battery_flat_s)
         seconds = (now - self.first_ns) // NS if self.encoding and now > self.first_ns else 0
         left = 0 if self.full or faults.no_card else max(64e9 - self.written, 0)
         return {

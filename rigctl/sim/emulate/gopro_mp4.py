@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.clocktime import NS
-from spikerig.dataset.errors import HostError
+from spikerig.dataset.errors import HostError, UsageError
 from spikerig.dataset.mp4_boxes import read_movie
 from spikerig.rigctl.sim.draws import stream
 from spikerig.rigctl.sim.emulate.gpmf_write import box, item, nest, telemetry_track
@@ -135,10 +135,12 @@ def _encode(path: Path, take: Recording, first: int, pictures: Pictures, most_by
             exposure_ns = round(float(exposures[k]) * NS)
             if not done:
                 height, width = pictures(int(starts[k]), exposure_ns, 0.0).shape[:2]
+                if width % 2 or height % 2:
+                    raise UsageError("a camera's picture has even sides", value=f"{width} x {height}")
                 video.width, video.height, video.pix_fmt = width, height, "yuvj420p"
             pixels = pictures(int(starts[k]), exposure_ns, take.srot_ms * 1e6 / height)
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24").reformat(
-                format="yuvj420p", dst_colorspace=1 if height >= 720 else 5, dst_color_range=2
+                format="yuvj420p", dst_colorspace=1 if height >= 720 else 5, dst_color_range=2, threads=1
             )
             frame.pts, frame.time_base = done, 1 / take.fps
             for packet in video.encode(frame):
@@ -160,7 +162,7 @@ def _add_telemetry(path: Path, take: Recording, first: int, stamped: int, frames
         _payload(take, k, min(k + per, first + stamped), first + frames) for k in range(first, first + stamped, per)
     ]  # fmt: skip
     lasts = [round(1000 * min(per, first + frames - k) / float(take.fps)) for k in range(first, first + stamped, per)]
-    offsets = (at + 8 + np.cumsum([0, *map(len, payloads[:-1])])).tolist()
+    offsets = (at + np.cumsum([0, *map(len, payloads[:-1])])).tolist()
     moov = raw[at + 8 :]
     scale = int.from_bytes(raw[raw.find(b"mvhd", at) + 16 :][:4], "big")
     track = telemetry_track(2, [len(p) for p in payloads], offsets, [max(n, 1) for n in lasts], scale)
@@ -168,7 +170,11 @@ def _add_telemetry(path: Path, take: Recording, first: int, stamped: int, frames
     cut = moov.find(b"udta") - 4  # ffmpeg's own, the last of its boxes
     moov = moov[:cut] if cut >= 0 else moov
     part = path.with_suffix(".part")
-    part.write_bytes(raw[:at] + box("mdat", *payloads) + box("moov", moov, user, track))
+    head = box("ftyp", b"mp41", bytes.fromhex("20131018"), b"mp41")  # as GoPro's; ffmpeg's is longer
+    start = raw.find(b"mdat") - 4
+    head += box("free", bytes(start - len(head) - 8))
+    media = box("mdat", raw[start + 8 : at], *payloads)  # one of them, as GoPro writes and its own reader wants
+    part.write_bytes(head + media + box("moov", moov, user, track))
     os.replace(part, path)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
 from collections.abc import Sequence
 
@@ -54,7 +55,7 @@ def full_box(kind: str, *inside: bytes, flags: int = 0) -> bytes:
 def telemetry_track(
     number: int, sizes: Sequence[int], offsets: Sequence[int], durations_ms: Sequence[int], movie_timescale: int
 ) -> bytes:
-    """A `trak` of format gpmd, a payload a chunk, 1000 units a second."""
+    """A `trak` of format gpmd, a payload a chunk, 1000 units a second; 64-bit offsets only where they must be."""
     count, total = len(sizes), sum(durations_ms)
     unity = struct.pack(">9I", 0x10000, 0, 0, 0, 0x10000, 0, 0, 0, 0x40000000)
     lasting = total * movie_timescale // 1000
@@ -62,14 +63,20 @@ def telemetry_track(
         "tkhd", struct.pack(">5I", 0, 0, number, 0, lasting), bytes(16), unity, bytes(8), flags=15
     )  # fmt: skip
     name = b"\x0bGoPro MET  "
-    runs = b"".join(struct.pack(">II", 1, d) for d in durations_ms)
+    lengths = [(len(list(same)), d) for d, same in itertools.groupby(durations_ms)]
+    runs = b"".join(struct.pack(">II", *run) for run in lengths)
+    wide = max(offsets, default=0) >= 1 << 32
     table = box(
         "stbl",
         full_box("stsd", struct.pack(">I", 1), box("gpmd", bytes(6), struct.pack(">HI", 1, 0))),
-        full_box("stts", struct.pack(">I", count), runs),
+        full_box("stts", struct.pack(">I", len(lengths)), runs),
         full_box("stsc", struct.pack(">4I", 1, 1, 1, 1)),
         full_box("stsz", struct.pack(">II", 0, count), struct.pack(f">{count}I", *sizes)),
-        full_box("co64", struct.pack(">I", count), struct.pack(f">{count}Q", *offsets)),
+        full_box(
+            "co64" if wide else "stco",
+            struct.pack(">I", count),
+            struct.pack(f">{count}{'Q' if wide else 'I'}", *offsets),
+        ),
     )
     media = box(
         "mdia",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from importlib.resources import files
 from pathlib import Path
@@ -14,9 +14,11 @@ import numpy as np
 
 from spikerig.dataset.clocktime import NS
 from spikerig.dataset.errors import UsageError
+from spikerig.dataset.wire import WireProfile
 from spikerig.rigctl.gopro import GoProSource
 from spikerig.rigctl.gopro_http import Web
 from spikerig.rigctl.gopro_radio import Radio
+from spikerig.rigctl.panel_view import PanelPlan, centres, mask
 from spikerig.rigctl.record import Rig
 from spikerig.rigctl.sim.emulate.gopro_air import Air
 from spikerig.rigctl.sim.emulate.gopro_camera import Faults as RgbFaults
@@ -25,11 +27,12 @@ from spikerig.rigctl.sim.emulate.gopro_web import AirWifi, WebServer
 from spikerig.rigctl.sim.emulate.harpbox import BoxFaults, HarpBoxWire
 from spikerig.rigctl.sim.emulate.latency import Latency
 from spikerig.rigctl.sim.emulate.oscillator import Oscillator
+from spikerig.rigctl.sim.emulate.panel_light import PanelInView
 from spikerig.rigctl.sim.emulate.serialport import device_errors
 from spikerig.rigctl.sim.emulate.spike_bench import bridge_of
 from spikerig.rigctl.sim.emulate.usb import EmulatedUsb
 from spikerig.rigctl.sim.emulate.virtual import VirtualHost
-from spikerig.rigctl.sim.emulate.world import Ticker, world_of
+from spikerig.rigctl.sim.emulate.world import PanelSeen, Ticker, world_of
 from spikerig.rigctl.sim.limits import Faults, limits, read_record
 from spikerig.rigctl.syncbox import HarpBox
 from spikerig.rigctl.take_plan import TakePlan
@@ -37,6 +40,7 @@ from spikerig.rigctl.vidar import VidarSource
 
 R = TypeVar("R")
 SHIPPED = {"demo": "demo.toml"}
+LED_SPIKES, LED_LIGHT = 0.4, 0.6  # of an LED that is on: spikes a tick, linear light
 CLOCK = ("offset_ns", "ppm", "ramp_ppm_per_min", "walk")
 
 
@@ -90,12 +94,13 @@ def load_rig_spec(path: str | Path) -> RigSpec:
     return spec
 
 
-def open_emulated(spec: RigSpec, plan: TakePlan, *, after_ns: int = 0) -> Rig:
+def open_emulated(spec: RigSpec, plan: TakePlan, *, card: Path, after_ns: int = 0) -> Rig:
     """The rig of a spec, for a plan: its viewpoints, profile and sync mode.
 
     Args:
         spec: the rig.
         plan: what it is for.
+        card: folder that stands for the RGB camera's memory card.
         after_ns: host time of what was recorded before, for a take that is gone on with.
 
     Raises:
@@ -107,12 +112,14 @@ def open_emulated(spec: RigSpec, plan: TakePlan, *, after_ns: int = 0) -> Rig:
     wire = plan.profile
     size = (wire.width, wire.height)
     world = world_of(spec.scene, len(plan.viewpoints), size, wire.rate_hz, host, spec.seed or None)
+    box = _box(spec, host) if plan.sync.mode == "box" else None
+    if box is not None and plan.panel is not None:
+        world.panel = _panel(plan.panel, box, size)
     ticker = Ticker(world, spec.seed)
     bridge = bridge_of({"seed": spec.seed, **spec.spike, "profile": _wire_table(wire)}, start_ns, ticker, "spike")
     ticker.tick_ns = bridge.wire.tick_true_ns
     usb = EmulatedUsb(host, [bridge])
-    camera = _camera(spec, host, world.frame) if plan.rgb.use else None
-    box = _box(spec, host) if plan.sync.mode == "box" else None
+    camera = _camera(spec, host, world.frame, card) if plan.rgb.use else None
     spike = VidarSource(wire, host, usb, serial=plan.spike.serial)
     rgb = None
     if camera is not None:
@@ -132,12 +139,81 @@ def open_emulated(spec: RigSpec, plan: TakePlan, *, after_ns: int = 0) -> Rig:
     return Rig(host, spike, rgb, sync, world.place, truth)
 
 
-def _camera(spec: RigSpec, host: VirtualHost, pictures: Any) -> GoProCamera:
+@dataclass(frozen=True, slots=True)
+class Transports:
+    """What the drivers of an emulated rig would talk to, without a scene: for finding and probing.
+
+    Args:
+        host: time.
+        usb: a pyusb backend.
+        profile: of the spike camera on it.
+        web, radio: to the GoPro.
+        ports: serial ports as `syncbox.find` takes them.
+        opener_of: of a port.
+        card: folder that stands for the RGB camera's card; whoever asked for it removes it.
+    """
+
+    host: VirtualHost
+    usb: EmulatedUsb
+    profile: WireProfile
+    web: Web
+    radio: Radio
+    ports: tuple[tuple[str, str], ...]
+    opener_of: Callable[[str], Any]
+    card: Path
+
+
+def transports_of(spec: RigSpec) -> Transports:
+    """The devices of a spec with nobody driving them; the spike camera sees a looped texture.
+
+    Args:
+        spec: the rig; `spike` may name a wire profile.
+
+    Raises:
+        UsageError: keys or values that are wrong.
+    """
+    host = VirtualHost(round(spec.start_s * NS))
+    bridge = bridge_of({"seed": spec.seed, **spec.spike}, host.now_ns(), where="spike")
+    camera, box = _camera(spec, host, _nothing, Path(mkdtemp(prefix="spikerig-card-"))), _box(spec, host)
+    web, radio = Web(AirWifi(WebServer(camera)), host), Radio(Air(camera).dial, host)
+    ports = (("emulated", "emulated"),)
+    return Transports(
+        host,
+        EmulatedUsb(host, [bridge]),
+        bridge.wire.profile,
+        web,
+        radio,
+        ports,
+        lambda _: device_errors(box.port),
+        camera.card,
+    )
+
+
+def _nothing(*_: Any) -> Any:
+    raise UsageError("an emulated rig without a scene records no pictures")
+
+
+def _panel(plan: PanelPlan, box: HarpBoxWire, size: tuple[int, int]) -> PanelSeen:
+    """The panel in pictures of the world's size: both arms are alike."""
+    width, height = size
+    panel = plan.panel
+    spike, rgb = (
+        PanelInView(panel, centres(panel, corners), radius, light, height, width)
+        for corners, radius, light in (
+            (plan.spike, plan.spike_radius_px, LED_SPIKES), (plan.rgb, plan.rgb_radius_px, LED_LIGHT)
+        )
+    )  # fmt: skip
+    dark = mask(panel, plan.spike, plan.spike_radius_px, height, width)
+    dark |= mask(panel, plan.rgb, plan.rgb_radius_px, height, width)
+    return PanelSeen(spike, rgb, dark, box.box_ns)
+
+
+def _camera(spec: RigSpec, host: VirtualHost, pictures: Any, card: Path) -> GoProCamera:
     table = dict(spec.rgb)
     nature = _of(Nature, table.pop("nature", {}), "rgb.nature")
     faults = _of(RgbFaults, table.pop("faults", {}), "rgb.faults")
     clock = _clock(table, spec.seed, "gopro", "rgb")
-    card = Path(mkdtemp(prefix="spikerig-card-"))
+    card.mkdir(parents=True, exist_ok=True)
     return GoProCamera(host, card, pictures, clock, nature, faults, spec.seed)
 
 

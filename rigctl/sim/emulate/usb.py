@@ -116,11 +116,11 @@ class EmulatedUsb:
 
     # -- handles ----------------------------------------------------------------------------------------------------
     def open_device(self, dev: Plug) -> Plug:
-        """A handle is the plug itself; it dies with it."""
+        """A handle dies with the plug it was opened on."""
         self._alive(dev)
         if dev.bridge.fault(self.host.now_ns(), "denied"):
             raise usb_error(errno.EACCES)
-        return dev
+        return Plug(dev.bridge, dev.plugged, dev.address)
 
     def close_device(self, dev_handle: Plug) -> None:
         """Interfaces go back."""
@@ -184,12 +184,15 @@ class EmulatedUsb:
         began = self.host.now_ns()
         until = began + (timeout * 1_000_000 if timeout else 1 << 62)
         plan = bridge.read(began, size, until, dev_handle.plugged)
-        self.host.sleep_until(plan.done_ns)
+        early = getattr(bridge.wire.source, "timeless", False)  # as the bus does it: while they come, not afterwards
+        if not early:
+            self.host.sleep_until(plan.done_ns)
         out = np.frombuffer(buff, np.uint8)
         at = 0
         for run in plan.runs:
             bridge.wire.copy(run.start, out[at : at + run.stop - run.start])
             at += run.stop - run.start
+        self.host.sleep_until(plan.done_ns)
         if plan.error:
             raise usb_error(plan.error)
         return at

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.dataset.clocktime import NS
+from spikerig.dataset.kernels import fire
 from spikerig.dataset.scene import Camera
 from spikerig.rigctl.host import Host
 from spikerig.rigctl.sim.caster.light import Stage, stage_of
 from spikerig.rigctl.sim.draws import stream
+from spikerig.rigctl.sim.emulate.panel_light import PanelInView
 from spikerig.rigctl.sim.rgb import encode
 from spikerig.rigctl.sim.shake import ShakePath
 from spikerig.rigctl.sim.spec import SceneSpec, load_scene_toml, with_changes
@@ -22,9 +24,26 @@ from spikerig.rigctl.sim.viewpoint import camera_of, view_path
 
 PICTURES = 17  # along a path, both ends included
 KEPT = 3  # viewpoints whose pictures are in memory
+BLACK = 0.02  # linear light of the panel's face
 GRID_NS = 500_000  # between the knots of the spike camera's light
 
 Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PanelSeen:
+    """The panel in both pictures.
+
+    Args:
+        spike, rgb: where it stands, its light in spikes a tick and in linear light.
+        dark: bool[H,W], its black face.
+        box_ns: the panel's time at true times.
+    """
+
+    spike: PanelInView
+    rgb: PanelInView
+    dark: NDArray[np.bool_]
+    box_ns: Callable[[NDArray[np.int64]], NDArray[np.int64]]
 
 
 @dataclass
@@ -37,6 +56,7 @@ class World:
     Args:
         spec: the scene; its camera is that of both arms.
         host: whose time is true time.
+        panel: the LED panel before both cameras; it stands still in their pictures.
 
     Attributes:
         moved: (true time, viewpoint) of each time the rig was brought somewhere.
@@ -44,6 +64,7 @@ class World:
 
     spec: SceneSpec
     host: Host
+    panel: PanelSeen | None = None
     moved: list[tuple[int, int]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -81,6 +102,8 @@ class World:
         if number not in self._cast:
             poses = self.path(number).poses(np.linspace(0, 1, PICTURES))
             self._cast[number] = np.stack([self.sharp(pose) for pose in poses])
+            if self.panel is not None:
+                self._cast[number][:, self.panel.dark] = BLACK
             while len(self._cast) > KEPT:
                 self._cast.popitem(last=False)
         return self._cast[number]
@@ -115,6 +138,10 @@ class World:
         np.add.at(weights, (rows, low), 1 - (where - low))
         np.add.at(weights, (rows, low + 1), where - low)
         mean = np.einsum("hk,khwc->hwc", (weights / steps).astype(np.float32), pictures, optimize=True)
+        if self.panel is not None:
+            view, rows = self.panel.rgb, begin.astype(np.int64)
+            on, off = self.panel.box_ns(rows), self.panel.box_ns(rows + exposure_ns)
+            mean[view.rows, view.columns] += view.of_rows(on, off - on)[:, None]
         return encode(mean)
 
 
@@ -129,10 +156,10 @@ class Ticker:
 
     def __init__(self, world: World, seed: int = 0) -> None:
         self.world = world
-        self.tick_ns = lambda tick: 0
+        self.tick_ns: Callable[[int], int] = lambda tick: 0
         size = (world.camera.height, world.camera.width)
         self._account: Account = opened(stream(seed, "emulated charge").random(size))
-        self._next: int | None = None
+        self._panel_charge: NDArray[np.uint32] | None = None
 
     def __call__(self, t0: int, t1: int) -> NDArray[np.uint8]:
         """Ticks [t0, t1), uint8[n,H,ceil(W/8)]; what was skipped since the last call was dark."""
@@ -140,8 +167,25 @@ class Ticker:
         count = max(1, round((end - begin) / GRID_NS))
         ticks = np.unique(np.rint(np.linspace(t0, t1, count + 1)).astype(int))
         light = [(int(t - t0), self.world.thresholds(self.tick_ns(int(t)))) for t in ticks]
-        self._next = t1
-        return np.concatenate(list(spike_blocks(light, self._account, hold=False, block_ticks=1 << 16)))
+        bits = np.concatenate(list(spike_blocks(light, self._account, hold=False, block_ticks=1 << 16)))
+        return bits if self.world.panel is None else self._with_panel(bits, self.world.panel, begin, end)
+
+    def _with_panel(self, bits: NDArray[np.uint8], seen: PanelSeen, begin: int, end: int) -> NDArray[np.uint8]:
+        """The LEDs' pixels fired anew under the black face's light and the panel's, exact within each tick."""
+        view = seen.spike
+        bounds = seen.box_ns(np.linspace(begin, end, len(bits) + 1).astype(np.int64))
+        spec = self.world.spec.sensor
+        light = view.of_ticks(bounds) + np.float32(BLACK * spec.gain * sum(spec.response))
+        count = len(view.rows)
+        if self._panel_charge is None:
+            self._panel_charge = stream(1, "panel charge").integers(0, 1 << 32, count, dtype=np.uint32)
+        fired, left, _ = fire(light[:, None, :], np.arange(len(light) + 1), self._panel_charge[None], hold=True)
+        self._panel_charge = left[0].astype(np.uint32)
+        rows, where = np.unique(view.rows, return_inverse=True)
+        pixels = np.unpackbits(bits[:, rows], axis=2, bitorder="little")
+        pixels[:, where, view.columns] = np.unpackbits(fired[:, 0], axis=1, bitorder="little", count=count)
+        bits[:, rows] = np.packbits(pixels, axis=2, bitorder="little")
+        return bits
 
 
 def _between(pictures: NDArray[np.float32], phase: float) -> NDArray[np.float32]:
@@ -167,8 +211,3 @@ def world_of(scene: str, views: int, size: tuple[int, int], rate_hz: float, host
     )
     spec = with_changes(spec, seed=seed, views=views)
     return World(replace(spec, exposure=replace(spec.exposure, rate_hz=rate_hz, sub_poses=PICTURES)), host)
-
-
-def seconds(ns: int) -> float:
-    """Nanoseconds as seconds."""
-    return ns / NS

@@ -146,7 +146,7 @@ class Video:
         self.facts |= {"full_range": full, "matrix": self._matrix(frame)}
         codes = frame.reformat(
             format="rgb48le" if deep else "rgb24", src_colorspace=self._matrix(frame), dst_color_range=2,
-            src_color_range=2 if full else 1,
+            src_color_range=2 if full else 1, threads=1,
         ).to_ndarray()  # fmt: skip
         light = _curve(self.transfer, deep).take(codes)
         primaries = PRIMARIES.get(int(self.stream.codec_context.color_primaries or 2), REC709)

@@ -1,0 +1,210 @@
+"""From a raw take to a scene: right in time, whole in spite of damage, honest about the rest."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from emulated_takes import plan_of, take
+
+from spikerig.calib.panel_read import Spot
+from spikerig.dataset.cli import run
+from spikerig.dataset.errors import DataError, RefusedError, UsageError
+from spikerig.dataset.kernels import count
+from spikerig.dataset.rawtake import WireBytes, open_take, read_lines
+from spikerig.dataset.segments import Chunk, scan
+from spikerig.dataset.store import open_scene, verify_scene
+from spikerig.rigctl.ingest import IngestConfig, ingest
+from spikerig.rigctl.ingest_sights import panel_pairs
+from spikerig.rigctl.ingest_times import Framing, Times, clip_number, read_truth
+from spikerig.rigctl.ingest_truth import TrueWorld
+
+
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("ingest") / "take"
+    tally = take(folder, plan_of(test_every=3))
+    assert tally.status == "complete"
+    return folder
+
+
+@pytest.fixture
+def folder(taken: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(taken, tmp_path / "take"))
+
+
+def first_byte(folder: Path) -> int:
+    """The camera's own number of the epoch's first byte, from what the rig says of itself."""
+    (end,) = [told for _, told in read_lines(folder / "log.jsonl") if told["kind"] == "end"]
+    return json.loads((folder / "truth.json").read_text())[0]["spike"][0]["sent"][-1][1] - end["bytes"]
+
+
+def test_ticks_begin_where_the_camera_began_them(taken: Path) -> None:
+    told = open_take(taken)
+    framing = Framing(WireBytes(told), [s for v in told.views() for s in v.spikes])
+    assert framing.offset(0) == -first_byte(taken) % 384
+
+
+def test_a_scene_right_in_time_and_place(taken: Path, tmp_path: Path) -> None:
+    out = tmp_path / "s.h5"
+    told = ingest(taken, out)
+    assert (told["views"], told["test"], told["left_out"], told["lost_ticks"]) == (3, ["000"], {}, 0)
+    assert verify_scene(out) == []
+    with open_scene(out) as file:
+        scene = file.read()
+    raw = open_take(taken)
+    truth = read_truth(raw)
+    times = Times(raw, truth)
+    world = TrueWorld(raw, times, truth).world
+    for view in scene.views[1:]:
+        spikes, frame = view.spikes, view.frame
+        assert spikes is not None
+        # every tick was exposed when the scene says
+        true_t0 = int(times.true_from_rig(truth[0], np.array([spikes.t0_ns]))[0])
+        device = 20_000 * (1 + 21e-6)
+        assert spikes.rate_hz == pytest.approx(device / (1 + 8e-6), rel=2e-6)
+        # the spikes cover the exposure and a margin
+        rows = frame.row_ns * (frame.pixels.shape[0] - 1)
+        margin = 256 / 20_000 * 1e9
+        assert spikes.t0_ns <= frame.start_ns - margin
+        assert spikes.t0_ns + spikes.ticks / spikes.rate_hz * 1e9 >= frame.start_ns + frame.exposure_ns + rows + margin
+        # and hold the light of those instants: counts of 2 ms pieces against the world's own light
+        number = int(view.name)
+        gray = world.pictures(number) @ (np.array(world.spec.sensor.response) * world.spec.sensor.gain)
+        off_ns = []
+        for first in range(100, spikes.ticks - 140, 100):
+            seen = count(spikes.bits, 64, first, first + 40).astype(float)
+            mid = true_t0 + round((first + 20) / spikes.rate_hz * 1e9)
+            off_ns.append(best_shift(world, gray, seen / 40, mid))
+        assert abs(np.median(off_ns)) < 150_000
+        assert np.allclose(view.pose.cam_from_world, world.poses(number, times.true_from_rig(truth[0],
+                           np.array([view.mid_ns])))[0], atol=1e-9)  # fmt: skip
+
+
+def best_shift(world, gray: np.ndarray, seen: np.ndarray, mid: int) -> float:
+    """By how many ns the light that fits best lies beside the instant told."""
+    shifts = np.arange(-1_000_000, 1_000_001, 50_000)
+    wrong = []
+    for shift in shifts:
+        at = np.array([mid + shift]) + np.linspace(-1e6, 1e6, 9).astype(int)
+        where = world.phase_at(at) * (len(gray) - 1)
+        low = np.minimum(where.astype(int), len(gray) - 2)
+        share = (where - low)[:, None, None]
+        wrong.append((((gray[low] * (1 - share) + gray[low + 1] * share).mean(0) - seen) ** 2).sum())
+    return float(shifts[int(np.argmin(wrong))])
+
+
+def test_several_frames_a_viewpoint_and_own_choices(taken: Path, tmp_path: Path) -> None:
+    out = tmp_path / "s.h5"
+    told = ingest(taken, out, IngestConfig(frames=3, test_every=0, truth=False, name="mine", margin_ticks=100))
+    assert told["views"] == 9
+    with open_scene(out) as file:
+        scene = file.read()
+    assert scene.name == "mine"
+    assert scene.truth is None
+    assert "calib poses" in scene.info["poses"]
+    starts = [v.frame.start_ns for v in scene.views if v.name.startswith("001-")]
+    assert np.allclose(np.diff(starts), 1001e6 / 120, atol=20_000)
+    with pytest.raises(UsageError, match="exists already"):
+        ingest(taken, out)
+
+
+def test_a_damaged_chunk_becomes_lost_ticks(folder: Path, tmp_path: Path) -> None:
+    whole = ingest(folder, tmp_path / "whole.h5")
+    assert whole["lost_ticks"] == 0
+    with open_scene(tmp_path / "whole.h5") as file:
+        before = file.read()
+    view = open_take(folder).views()[1]
+    _, start, stop = view.spikes[0]
+    found = [c for path in sorted((folder / "spikes").glob("*.seg")) for c in scan(path)]
+    hit = next(c for c in found if isinstance(c, Chunk) and start <= (start + stop) // 2 - 100_000
+               <= c.head.byte_index + c.head.payload)  # fmt: skip
+    data = bytearray(hit.path.read_bytes())
+    data[hit.offset + 5] ^= 1
+    hit.path.write_bytes(data)
+    told = ingest(folder, tmp_path / "s.h5")
+    assert told["lost_ticks"] > 100
+    with open_scene(tmp_path / "s.h5") as file:
+        scene = file.read()
+    spikes, good = scene.view("001").spikes, before.view("001").spikes
+    assert spikes is not None
+    assert good is not None
+    lost = np.zeros(spikes.ticks, bool)
+    for a, b in spikes.lost:
+        lost[a:b] = True
+    assert not spikes.bits[lost].any()
+    assert np.array_equal(spikes.bits[~lost], good.bits[~lost])
+    assert lost.any()
+    assert len(scene.view("002").spikes.lost) == 0
+
+
+def test_what_cannot_be_cut_is_left_out_and_told(folder: Path, tmp_path: Path) -> None:
+    views = open_take(folder).views()
+    (folder / "rgb" / views[1].clips[0]).write_bytes(b"no clip at all")
+    lines = [told for _, told in read_lines(folder / "views.jsonl")]
+    last = next(line for line in reversed(lines) if line["name"] == "002")
+    with (folder / "views.jsonl").open("a") as file:
+        file.write(json.dumps(last | {"clips": []}) + "\n")
+    assert run(["data", "ingest", str(folder), "-o", str(tmp_path / "s.h5")]) == 1
+    told = ingest(folder, tmp_path / "s.h5", force=True)
+    assert told["views"] == 1
+    assert sorted(told["left_out"]) == ["001", "002"]
+    assert "its clip is not in the take" in told["left_out"]["002"]
+    with (folder / "views.jsonl").open("a") as file:
+        file.write(json.dumps(next(x for x in lines if x["name"] == "000") | {"clips": []}) + "\n")
+    with pytest.raises(DataError, match="no view can be made"):
+        ingest(folder, tmp_path / "none.h5")
+    assert not (tmp_path / "none.h5").exists()
+
+
+def test_without_the_panel_and_without_truth_nothing_is_paired(folder: Path, tmp_path: Path) -> None:
+    (folder / "truth.json").unlink()
+    with pytest.raises(DataError, match="no view can be made") as caught:
+        ingest(folder, tmp_path / "s.h5")
+    assert "nothing ties this clip's frames" in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["{", "{}", "[3]", '[{"rgb": 3}]'])
+def test_a_truth_that_lies_is_refused(folder: Path, tmp_path: Path, text: str) -> None:
+    (folder / "truth.json").write_text(text)
+    with pytest.raises(DataError):
+        ingest(folder, tmp_path / "s.h5")
+
+
+def test_names_of_clips() -> None:
+    assert clip_number("100GOPRO/GX010078.MP4") == 78
+    with pytest.raises(DataError):
+        clip_number("../../etc/passwd")
+
+
+WIDE = {"name": "wide", "width": 160, "height": 96, "row_bits": 160, "rate_hz": 20_000, "packet_bytes": 16384}
+EDGES = [6, 5, 154, 5, 6, 91, 154, 91]
+PANEL = {"bits": 12, "slow": 7, "spike": EDGES, "rgb": EDGES, "spike_radius_px": 2.5, "rgb_radius_px": 2.5}
+
+
+def test_the_panel_ties_frames_and_spikes_without_any_truth(tmp_path: Path) -> None:
+    folder = tmp_path / "take"
+    take(folder, plan_of(viewpoints=2, spike={"wire": WIDE}, panel=PANEL))
+    raw = open_take(folder)
+    spans = [s for v in raw.views() for s in v.spikes]
+    wire = WireBytes(raw)
+    assert Framing(wire, spans, panel_pairs(raw)).offset(0) == -first_byte(folder) % raw.profile.tick_bytes
+    with pytest.raises(RefusedError, match="where ticks begin"):
+        Framing(wire, spans, [(Spot(0, 60.0 + x, 30.0, 2.5), Spot(1, 60.0 + x, 60.0, 2.5)) for x in (0, 11)]).offset(0)
+    truth = read_truth(raw)
+    (folder / "truth.json").unlink()
+    told = ingest(folder, tmp_path / "s.h5")
+    assert (told["views"], told["left_out"], told["panel_unread"]) == (2, {}, {})
+    assert told["rgb_times"] == {"sights": 2}
+    assert told["sigma_us"] < 300
+    with open_scene(tmp_path / "s.h5") as file:
+        scene = file.read()
+    times = Times(raw, truth)
+    clips = {v.name: clip_number(v.clips[0]) for v in raw.views()}
+    for view in scene.views:
+        rows = [r for r in truth[0]["rgb"] if r["event"] == "clip" and r["number"] == clips[view.name]]
+        off = times.rig_from_true(truth[0], np.array(rows[0]["true_ns"])) - view.frame.start_ns
+        assert np.abs(off).min() < 300_000
+        assert not view.valid[5, 6]  # an LED
+        assert view.valid[48, 64]
