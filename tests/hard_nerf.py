@@ -78,6 +78,12 @@ ROWS = [
         RAYS + "samples_stay_in_the_one_full_cell_and_stand_for_its_length",
     ),
     (
+        "every weight of the networks",
+        "trace_hashed",
+        "gradcheck in float64",
+        RAYS + "gradients_of_the_fast_field",
+    ),
+    (
         "log density 500",
         "density_of",
         "finite, with a gradient that leads back",

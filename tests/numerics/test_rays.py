@@ -303,3 +303,19 @@ def test_a_density_beyond_all_bounds_is_finite_and_can_come_back():
     assert grad is not None
     assert grad[0] > 0
     assert torch.isfinite(grad).all()
+
+
+def test_gradients_of_the_fast_field():
+    rng = np.random.default_rng(9)
+    params, grids = start_hashed(FAST)
+    wide = {name: p.double() + torch.from_numpy(rng.normal(0, 0.1, p.shape)) for name, p in params.items()}
+    thin = rays_of(CAMERA, torch.tensor([[1.0, 0, 0, 0.1], [0, 1, 0, -0.1], [0, 0, 1, 0.9]]).double(),
+                   torch.tensor([100, 330]))  # fmt: skip
+    names = [name for name in params if name != "table"]
+
+    def seen(*values):
+        (out,) = trace_hashed({"table": wide["table"], **dict(zip(names, values, strict=True))}, grids, FAST, thin,
+                              BEHIND.double(), None)  # fmt: skip
+        return out.colour, out.alpha, out.depth
+
+    assert gradcheck(seen, tuple(wide[name].requires_grad_() for name in names), atol=1e-6, fast_mode=True)
