@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from spikerig.calib.gauge import degrees_apart
 from spikerig.dataset.errors import NumericsError
 from spikerig.dataset.scene import Floats
-from spikerig.train.model import Model
+from spikerig.train.model import SplatModel
 from spikerig.train.trajectory import compose, exp_se3
 
 STEPS = 60
@@ -39,7 +39,7 @@ def twist_gradient(pose: Floats, gradient: Floats) -> Floats:
     return np.concatenate([np.cross(pose.T, gradient.T).sum(0), gradient[:, 3]])
 
 
-def realign(model: Model, pose: Floats, picture: NDArray[np.uint8], steps: int = STEPS) -> Aligned:
+def realign(model: SplatModel, pose: Floats, picture: NDArray[np.uint8], steps: int = STEPS) -> Aligned:
     """Move a camera to where the model's picture has the least squared error; it never ends worse than it began.
 
     Args:
@@ -81,7 +81,7 @@ def realign(model: Model, pose: Floats, picture: NDArray[np.uint8], steps: int =
     return Aligned(world, deg, _moved_px(K, start, best), first, lowest)
 
 
-def _look(model: Model, pose: Floats, target: torch.Tensor) -> tuple[float, Floats]:
+def _look(model: SplatModel, pose: Floats, target: torch.Tensor) -> tuple[float, Floats]:
     camera = torch.tensor(pose, dtype=torch.float32, requires_grad=True)
     loss = (model.draw(camera).image.cpu() - target).square().mean()
     loss.backward()
@@ -91,7 +91,7 @@ def _look(model: Model, pose: Floats, target: torch.Tensor) -> tuple[float, Floa
     return value, gradient.numpy().astype(np.float64)
 
 
-def _to_world(model: Model, pose: Floats) -> Floats:
+def _to_world(model: SplatModel, pose: Floats) -> Floats:
     R, t = pose[:, :3], pose[:, 3]
     return np.concatenate([R, (t / model.gauge.scale - R @ np.array(model.gauge.centre))[:, None]], axis=1)
 

@@ -18,8 +18,9 @@ from spikerig.dataset.scene import Floats
 from spikerig.dataset.terminal import note
 from spikerig.train import metrics
 from spikerig.train.bridge import Bridge, Cameras, bridge, stored_cameras, true_pose
+from spikerig.train.field import Model
 from spikerig.train.metrics import SSIM_VARIANTS, rounded
-from spikerig.train.model import BACKGROUNDS, Model
+from spikerig.train.model import BACKGROUNDS
 from spikerig.train.quality import Judges, compare, judge_alone, means
 from spikerig.train.realign import STEPS, realign
 from spikerig.train.targets import truth_pose

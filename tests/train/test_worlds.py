@@ -18,7 +18,7 @@ from spikerig.dataset.store import open_scene, write_scene
 from spikerig.train import metrics
 from spikerig.train.bridge import bridge
 from spikerig.train.config import configure
-from spikerig.train.model import Model
+from spikerig.train.model import SplatModel
 from spikerig.train.nerfbaselines import write_results
 from spikerig.train.realign import realign, twist_gradient
 from spikerig.train.record import open_run
@@ -198,7 +198,7 @@ def test_alignment_of_a_broken_model_is_told(tiny, oracle):
     with open_scene(tiny) as scene:
         exam = novel_views(scene)[0][0]
 
-    class Broken(Model):
+    class Broken(SplatModel):
         def draw(self, pose, background=None, sh_degree=None):
             drawn = super().draw(pose, background, sh_degree)
             return replace(drawn, image=drawn.image * float("nan"))
