@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spikerig.calib.estimate import Estimate, Wanted
 from spikerig.calib.gauge import centres, extent
 from spikerig.calib.mapping import Map
-
-if TYPE_CHECKING:
-    from spikerig.calib.poses import Estimate, Wanted
 
 Floats = NDArray[np.float64]
 # A free focal length that is off by the first, and takes the second of the residual with it, says that K is wrong.

@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.calib.consensus import Path, agree, apart_by, averaged, paths_through, still_paths
+from spikerig.calib.estimate import Estimate, Wanted
 from spikerig.calib.mapping import Map, Options, build_map
 from spikerig.calib.pattern import fixed_pattern
 from spikerig.calib.pictures import KINDS, Looks, frame_picture, looks, picture_of, texture_of
@@ -25,68 +26,6 @@ Floats = NDArray[np.float64]
 LOOKED_AT = 6  # views on which the kinds of texture are judged
 APART = (0.2, 0.8)  # phases of the two instants that features are compared between: windows share no spike
 HARDER = {"peak_threshold": 0.0015, "max_ratio": 0.85}
-
-
-@dataclass(frozen=True, slots=True)
-class Wanted:
-    """What to estimate, and what is good enough.
-
-    Args:
-        arms: pictures of the `spike` arm, of `rgb`, or of `both` as a COLMAP rig of fixed relative pose.
-        kinds: of texture; empty chooses by how many features are found again, and how near (sharpness and noise).
-        maps: how many kinds of texture are mapped independently; two or more can disagree, and then nothing is kept.
-        instants: poses over each exposure, ends included; 1 gives the middle alone.
-        min_share: of the views that must be placed.
-        max_error_px: mean residual above which a map is refused.
-        pattern: the sensor's fixed pattern, measured on the views themselves, is divided out of their textures.
-    """
-
-    arms: str = "spike"
-    kinds: tuple[str, ...] = ()
-    maps: int = 3
-    instants: int = 5
-    min_share: float = 0.8
-    max_error_px: float = 1.5
-    pattern: bool = True
-
-    def __post_init__(self) -> None:
-        if self.arms not in ("spike", "rgb", "both"):
-            raise UsageError("unknown arms", value=self.arms, expected="spike, rgb or both")
-        if not (1 <= self.maps <= 8 and 1 <= self.instants <= 101 and 0 < self.min_share <= 1):
-            raise UsageError(
-                "maps, instants or min_share out of range", value=(self.maps, self.instants, self.min_share)
-            )
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """Poses in a world of their own, and why to trust them or not.
-
-    Args:
-        images: names of all views asked for.
-        poses: cam_from_world [3,4] at mid-exposure, by view, of those placed.
-        paths: over the exposure, by view; one without chi-square was not measured and stands still.
-        best: the map they come from.
-        kinds: of texture mapped; the first is `best`'s.
-        looked: sharpness and noise of the kinds.
-        agreement_deg, agreement_share: largest median difference between the maps that agree.
-        agreeing: how many of the maps agree with the best, itself included, and how many there were.
-        reasons: why it is refused; empty when it is not.
-        pattern_sd: of the fixed pattern that was divided out (a share of the light); None: nothing was.
-    """
-
-    images: tuple[str, ...]
-    poses: Mapping[str, Floats]
-    paths: Mapping[str, Path]
-    best: Map
-    kinds: tuple[str, ...]
-    looked: tuple[Looks, ...] = ()
-    agreement_deg: float | None = None
-    agreement_share: float | None = None
-    agreeing: tuple[int, int] = (1, 1)
-    reasons: tuple[str, ...] = ()
-    seconds: Mapping[str, float] = field(default_factory=dict)
-    pattern_sd: float | None = None
 
 
 def estimate_poses(
