@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from spikerig.calib.gauge import degrees_apart
 from spikerig.dataset.errors import NumericsError
+from spikerig.dataset.rigid import compose, exp_se3
 from spikerig.dataset.scene import Floats
 from spikerig.train.model import SplatModel
-from spikerig.train.trajectory import compose, exp_se3
 
 STEPS = 60
 FIRST_PX, LAST_PX = 0.5, 0.02  # what a step moves the picture's middle by, at the start and at the end

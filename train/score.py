@@ -20,7 +20,7 @@ from spikerig.train import metrics
 from spikerig.train.bridge import Bridge, Cameras, bridge, stored_cameras, true_pose
 from spikerig.train.field import Model
 from spikerig.train.metrics import SSIM_VARIANTS, rounded
-from spikerig.train.model import BACKGROUNDS
+from spikerig.train.model import BACKGROUNDS, SplatModel
 from spikerig.train.quality import Judges, compare, judge_alone, means
 from spikerig.train.realign import STEPS, realign
 from spikerig.train.targets import truth_pose
@@ -161,7 +161,7 @@ def _mean(values: Iterable[float | None]) -> float | None:
 
 
 def grade_aligned(
-    model: Model, exams: Sequence[Exam], steps: int, *, ssim: str = "torchmetrics", judges: Judges | None = None
+    model: SplatModel, exams: Sequence[Exam], steps: int, *, ssim: str = "torchmetrics", judges: Judges | None = None
 ) -> dict[str, Any]:
     """The same after each camera was moved onto the picture it is scored on, and how far each moved."""
     found = [realign(model, exam.pose, exam.picture, steps) for exam in exams]
@@ -231,11 +231,13 @@ def score_run(
     novel, blurred, gauge = bring_over(scene, novel, blurred, trained, estimated)
     if align_steps is None:
         align_steps = STEPS if estimated or (gauge is not None and not gauge["same_world"]) else 0
-    if align_steps and not hasattr(model, "draw"):
+    if align_steps and not isinstance(model, SplatModel):
         note(f"cameras are not aligned: the field '{model.config.field}' gives no gradient of a pose")
         align_steps = 0
     graded = grade(model, novel, ssim=ssim, judges=judges, keep=keep) if novel else None
-    aligned = grade_aligned(model, novel, align_steps, ssim=ssim, judges=judges) if novel and align_steps else None
+    aligned = None
+    if novel and align_steps and isinstance(model, SplatModel):
+        aligned = grade_aligned(model, novel, align_steps, ssim=ssim, judges=judges)
     alone = None
     if quality or (against == STORED and not blurred):
         poses = {e.name: e.pose for e in novel} or (trained or stored_cameras(scene))
