@@ -208,7 +208,7 @@ class Loop:
                 raise DeviceError("the spike camera gives no bytes", value=name, next="mend it, then --resume")
             if not whole and self.plan.advance == "auto" and tried >= self.plan.tries:
                 raise DeviceError("the RGB camera ends its recordings early", value=name,
-                                  cause=view.checks["rgb_trouble"] or None, next="mend it, then --resume")  # fmt: skip
+                                  cause=str(view.checks["rgb_trouble"]), next="mend it, then --resume")  # fmt: skip
             if self._good_enough(amiss, tried, whole):
                 break
             self.writer.view(replace(view, kept=False))

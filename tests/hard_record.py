@@ -41,4 +41,12 @@ ROWS = [
      CUT + "test_a_damaged_chunk_becomes_lost_ticks"),
     ("black panel at both edges of the picture", "Framing", "the panel tells where ticks begin",
      CUT + "test_the_panel_ties_frames_and_spikes_without_any_truth"),
+    ("a loss of a few bytes that time cannot see", "ingest", "found by the picture, put back, its ticks lost",
+     CUT + "test_a_loss_that_time_cannot_see_becomes_lost_ticks"),
+    ("bytes in doubt when a take ends", "ingest", "their ticks are lost",
+     CUT + "test_bytes_in_doubt_when_the_take_ended_are_suspect"),
+    ("an RGB recording that ends by itself", "record", "told and taken again",
+     LOOP + "test_a_recording_that_ends_early_is_not_kept"),
+    ("an RGB camera that forgets a setting", "record", "the fetched clip tells",
+     LOOP + "test_a_fetched_clip_that_is_not_as_asked_is_told"),
 ]  # fmt: skip

@@ -17,6 +17,7 @@ from spikerig.dataset.segments import Chunk, scan
 from spikerig.dataset.store import open_scene, verify_scene
 from spikerig.rigctl.ingest import IngestConfig, ingest
 from spikerig.rigctl.ingest_sights import panel_pairs
+from spikerig.rigctl.ingest_slips import MendedBytes
 from spikerig.rigctl.ingest_times import Framing, Times, clip_number, read_truth
 from spikerig.rigctl.ingest_truth import TrueWorld
 
@@ -229,3 +230,17 @@ def test_a_loss_that_time_cannot_see_becomes_lost_ticks(taken: Path, tmp_path: P
     ((a, b),) = scene.view("001").spikes.lost
     assert 0 < b - a <= 100
     assert told["lost_ticks"] == b - a
+
+
+def test_bytes_in_doubt_when_the_take_ended_are_suspect(folder: Path) -> None:
+    raw = open_take(folder)
+    _, start, stop = raw.views()[-1].spikes[0]
+    assert MendedBytes(raw, []).suspect(0, start, stop) == []
+    (end,) = [told for _, told in read_lines(folder / "log.jsonl") if told["kind"] == "end"]
+    doubt = end["bytes"] - stop + 5_000  # as the driver's `doubtful_bytes` would have it
+    with (folder / "log.jsonl").open("a") as file:
+        file.write(json.dumps(end | {"suspect_bytes": doubt}) + "\n")
+    assert MendedBytes(raw, []).suspect(0, start, stop) == [(stop - 5_000, stop)]
+    (folder / "log.jsonl").write_text('{"kind": "end", "epoch": "x", "bytes": 1}\n')
+    with pytest.raises(DataError, match="log is damaged"):
+        MendedBytes(raw, [])

@@ -8,11 +8,32 @@ from framing_scenes import wire_bytes
 from vidar_bench import K20
 
 from spikerig.dataset import cli
+from spikerig.dataset.rawtake import open_take
 from spikerig.rigctl import rig_cli, usbport
 from spikerig.rigctl.probe import examine
 from spikerig.rigctl.profiles import PROFILES
 
 K416 = PROFILES["vidar-400x250-20k-416"]
+
+PLAN = """name = "small"
+viewpoints = 1
+seconds = 0.1
+advance = "auto"
+[spike.wire]
+name = "tiny"
+width = 64
+height = 48
+row_bits = 64
+rate_hz = 20000
+packet_bytes = 16384
+[rgb]
+use = false
+[checks]
+spare_gb = 0.001
+[recorder]
+on_full = "wait"
+ring_s = 0.3
+"""
 
 
 @pytest.fixture
@@ -143,3 +164,21 @@ def test_a_camera_that_says_nothing_is_told(tmp_path, capsys):
     assert "says nothing" in doc["error"]["what"]
     spec.write_text("[spike\n")
     assert told(capsys, "rig", "probe", "--emulate", str(spec))[0] == 2
+
+
+def test_find_probe_and_record_read_the_same_rig(tmp_path, capsys):
+    rig, plan = tmp_path / "rig.toml", tmp_path / "plan.toml"
+    rig.write_text('[spike]\nserial = "E7"\nppm = 35.0\nram_bytes = 16777216\n')
+    plan.write_text(PLAN)
+    code, doc = told(capsys, "rig", "find", "--emulate", str(rig))
+    assert (code, doc["kinds"]["spike"]["devices"][0]["serial"]) == (0, "E7")
+    code, doc = told(capsys, "rig", "probe", "--emulate", str(rig), "--megabytes", "4", "--serial", "E7")
+    assert code == 0
+    code, _ = told(capsys, "rig", "record", str(plan), "-o", str(tmp_path / "take"), "--emulate", str(rig))
+    assert code == 0
+    assert open_take(tmp_path / "take").devices[0]["serial"] == "E7"
+    rig.write_text('[spike]\nserail = "E7"\n')
+    for words in (["find"], ["probe"], ["record", str(plan), "-o", str(tmp_path / "none")]):
+        code, doc = told(capsys, "rig", *words, "--emulate", str(rig))
+        assert code == 2
+        assert "serail" in json.dumps(doc)
