@@ -106,4 +106,6 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeyp
     copy.write_text(copy.read_text().replace("20k", "40k"))
     capsys.readouterr()
     assert run(["rig", "plan", str(copy)]) == 1
-    assert "CANNOT  the camera makes more bytes" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "CANNOT  the camera makes more bytes" in said
+    assert "500 MB/s" in said
