@@ -88,7 +88,8 @@ def _opener(port: str | None, emulate: bool) -> Callable[[Any], Callable[[], Any
     """Given the host, what opens the box."""
 
     def of(host: Any) -> Callable[[], Any]:
-        from spikerig.rigctl.syncbox import HarpBox, find, serial_opener
+        from spikerig.rigctl.serial_ports import find, serial_opener
+        from spikerig.rigctl.syncbox import HarpBox
 
         if emulate:
             return _emulated(host)

@@ -35,7 +35,8 @@ def open_rig(plan: TakePlan, take: Path, emulate: str = "", resume: bool = False
 
 
 def _real(plan: TakePlan) -> Rig:
-    from spikerig.rigctl.syncbox import HarpBox, find, serial_opener
+    from spikerig.rigctl.serial_ports import find, serial_opener
+    from spikerig.rigctl.syncbox import HarpBox
     from spikerig.rigctl.vidar import VidarSource
 
     host = RealHost()

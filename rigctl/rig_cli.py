@@ -186,7 +186,7 @@ def _rgb(bench: Any) -> Found:
 
 
 def _sync(bench: Any) -> Found:
-    from spikerig.rigctl.syncbox import find as search
+    from spikerig.rigctl.serial_ports import find as search
 
     return search(RealHost()) if bench is None else search(bench.host, bench.ports, bench.opener_of)
 

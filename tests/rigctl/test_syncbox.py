@@ -10,11 +10,12 @@ from harp_rigs import S, box_on, rig
 
 from spikerig.dataset.errors import DeviceError
 from spikerig.rigctl import harp
+from spikerig.rigctl.serial_ports import find, serial_opener
 from spikerig.rigctl.sim.emulate.harpbox import BoxFaults, HarpBoxWire
 from spikerig.rigctl.sim.emulate.latency import Latency
 from spikerig.rigctl.sim.emulate.oscillator import Oscillator
 from spikerig.rigctl.sim.emulate.serialport import device_errors
-from spikerig.rigctl.syncbox import HarpBox, find, serial_opener
+from spikerig.rigctl.syncbox import HarpBox
 
 FIRMWARES = ["atxmega", "pico"]
 

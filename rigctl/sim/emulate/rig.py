@@ -148,7 +148,7 @@ class Transports:
         usb: a pyusb backend.
         profile: of the spike camera on it.
         web, radio: to the GoPro.
-        ports: serial ports as `syncbox.find` takes them.
+        ports: serial ports as `serial_ports.find` takes them.
         opener_of: of a port.
         card: folder that stands for the RGB camera's card; whoever asked for it removes it.
     """
