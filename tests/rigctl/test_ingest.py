@@ -230,6 +230,10 @@ def test_a_loss_that_time_cannot_see_becomes_lost_ticks(taken: Path, tmp_path: P
     ((a, b),) = scene.view("001").spikes.lost
     assert 0 < b - a <= 100
     assert told["lost_ticks"] == b - a
+    bits = scene.view("001").spikes.bits  # on either side of the loss the picture lies at the same place
+    before, after = (count(bits, 64, t, t + 64).astype(float).ravel() for t in (a - 64, b))
+    alike = [np.corrcoef(np.roll(before, -8 * by), after)[0, 1] for by in (0, lost, -lost)]
+    assert alike[0] > max(alike[1:]) + 0.1, alike
 
 
 def test_bytes_in_doubt_when_the_take_ended_are_suspect(folder: Path) -> None:

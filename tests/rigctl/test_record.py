@@ -262,3 +262,5 @@ def test_a_recording_that_ends_early_is_not_kept(tmp_path: Path) -> None:
     assert tally.retaken == 1
     assert "too hot" in tally.poor["000"][0]  # a camera that is still hot is told
     assert any("stopped by itself (it is too hot)" in said for said in operator.said)
+    with pytest.raises(DeviceError, match="ends its recordings early"):  # and never kept, however few tries
+        take(tmp_path / "once", plan_of(viewpoints=1, seconds=0.5, tries=1), rgb={"faults": {"too_hot_s": at_s}})
