@@ -18,6 +18,7 @@ from spikerig.dataset.clocktime import ClockModel
 from spikerig.dataset.errors import DataError
 from spikerig.dataset.marks import Mark, Probe, Reset, Sight
 
+LEAST_PPM = 2.0  # a camera's clips differ by as much: it warms
 LEAST_NS = {"two-way": 100_000.0, "one-way": 1_000_000.0, "sights": 400_000.0}  # smaller steps are not told apart
 
 
@@ -107,14 +108,26 @@ def _two_way(epoch: int, probes: Sequence[Probe], options: Options) -> list[Piec
 def _sights(clock: str, groups: list[tuple[int, list[Sight]]], options: Options) -> list[Piece]:
     lags = any(s.predicted for _, group in groups for s in group)
     pairs = [(epoch, sight_pairs(group, lags)) for epoch, group in groups]
-    rest = (options, LEAST_NS["sights"], ALLOWED_NS[clock], False)
-    told = [p for epoch, own in pairs for p in _pieces(clock, epoch, "sights", "box", own, *rest)]
-    if clock != "rgb" or len(told) < 2 or not lags:
+    rest = (LEAST_NS["sights"], ALLOWED_NS[clock], False)
+    if clock == "rgb" and lags and len(pairs) > 1:
+        options = replace(options, wander=replace(options.wander, skew_ppm=0.0))
+    told = [p for epoch, own in pairs for p in _pieces(clock, epoch, "sights", "box", own, options, *rest)]
+    if options.wander.skew_ppm is None:
         return told
-    # A clip shows few edges in frames coded by themselves; all clips of the camera together tell how late the rest is.
-    mean, sd = pooled([p.track for p in told], pairs[0][1].prior)
-    again = [p for epoch, own in pairs for p in _pieces(clock, epoch, "sights", "box", around(own, mean, sd), *rest)]
-    return [replace(p, track=replace(p.track, constants=p.track.constants + mean)) for p in again]
+    # A clip is short, and few of its frames are coded by themselves: all clips of the camera together tell how late
+    # the others are, and how fast its clock runs.
+    tracks = [p.track for p in told]
+    mean, sd = pooled([t.constants for t in tracks], [t.constants_sd for t in tracks], pairs[0][1].prior)
+    wander = options.wander
+    (ppm,), (within,) = pooled(
+        [np.array([t.skew_ppm]) for t in tracks], [np.array([t.skew_sd_ppm]) for t in tracks], np.array([wander.ppm])
+    )
+    options = replace(options, wander=replace(wander, skew_ppm=float(ppm), ppm=float(max(within, LEAST_PPM))))
+    told = [
+        p for epoch, own in pairs
+        for p in _pieces(clock, epoch, "sights", "box", around(own, mean, sd), options, *rest)
+    ]  # fmt: skip
+    return [replace(p, track=replace(p.track, constants=p.track.constants + mean)) for p in told]
 
 
 def _one_way(clock: str, epoch: int, probes: Sequence[Probe], options: Options) -> list[Piece]:

@@ -42,23 +42,23 @@ def sight_pairs(sights: Sequence[Sight], lags: bool = False) -> Pairs:
     return Pairs(device, panel, sd, extra, np.array([RESPONSE_NS, ROW_NS, LAG_NS][:many]))
 
 
-def pooled(tracks: Sequence[Track], prior: Floats) -> tuple[Floats, Floats]:
-    """The constants that clips of one camera share, and how far a clip's own may lie from them.
+def pooled(found: Sequence[Floats], found_sd: Sequence[Floats], prior: Floats) -> tuple[Floats, Floats]:
+    """What clips of one camera share (constants, frequency), and how far a clip's own may lie from it.
 
     Args:
-        tracks: of the clips, each fitted by itself with the same constants.
-        prior: float64[E], deviations they were fitted with.
+        found, found_sd: float64[E] of each clip, fitted by itself.
+        prior: float64[E], deviations from 0 they were fitted with.
 
     Returns:
         (mean, sd) float64[E]: sd holds what is unknown of the mean and what clips differ by.
 
     Source: DerSimonian, Laird 1986, on what each clip's own sights say (the prior taken off).
     """
-    found, sd = (np.array([getattr(t, n) for t in tracks]) for n in ("constants", "constants_sd"))
+    said, sd = np.array(found), np.array(found_sd)
     weight = np.maximum(1 / sd**2 - 1 / prior**2, 1e-3 / prior**2)
-    own = found / sd**2 / weight
+    own = said / sd**2 / weight
     mean = (weight * own).sum(0) / weight.sum(0)
-    spread = (weight * (own - mean) ** 2).sum(0) - (len(tracks) - 1)
+    spread = (weight * (own - mean) ** 2).sum(0) - (len(said) - 1)
     between = np.maximum(spread / (weight.sum(0) - (weight**2).sum(0) / weight.sum(0)), 0)
     weight = 1 / (1 / weight + between)
     mean = (weight * own).sum(0) / (weight.sum(0) + 1 / prior**2)

@@ -224,7 +224,19 @@ def _track(path: Path, size: int, raw: dict[str, bytes]) -> Track:
         raise damaged(path, f"a {form!r} sample lies beyond the end of the file")
     if handler != "vide" and int(sizes.sum()) > size:
         raise damaged(path, f"the samples of {form!r} overlap")
-    return Track(handler, form, timescale, width, height, sizes, offsets, dts, dts + shift, durations, _keys(path, raw, len(sizes)))
+    return Track(
+        handler,
+        form,
+        timescale,
+        width,
+        height,
+        sizes,
+        offsets,
+        dts,
+        dts + shift,
+        durations,
+        _keys(path, raw, len(sizes)),
+    )
 
 
 def _keys(path: Path, raw: dict[str, bytes], count: int) -> NDArray[np.bool_]:
