@@ -90,7 +90,7 @@ def _blocks(looks: Iterable[tuple[int, int, NDArray] | Look], spots: Sequence[Sp
     rows: list[tuple[int, int, Floats, Floats, bool]] = []
     disks: list[tuple[slice, slice, NDArray[np.bool_]]] = []
     for told in looks:
-        start, exposure, light, predicted = Look(*told)
+        start, exposure, light, predicted = told if isinstance(told, Look) else Look(*told)
         disks = disks or [s.disk(*light.shape[:2]) for s in spots]
         values = [np.asarray(light[r, c][inside], np.float64) for r, c, inside in disks]
         noise = np.array([v.std() / np.sqrt(len(v)) for v in values])
