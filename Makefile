@@ -50,8 +50,9 @@ types: install
 	  print(pathlib.Path(_native.__file__).parent / '_native.pyi')") .typing/spikerig/
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+# A process a core, whole files each: what a file sets up once stays set up once. torch gets one thread in each.
 unit: install
-	$(BIN)/python -m pytest tests
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests -n logical --maxprocesses 4 --dist loadfile
 
 doctest: install
 	$(BIN)/python -m pytest -q -p no:cacheprovider --doctest-modules --pyargs \

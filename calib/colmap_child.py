@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from spikerig.calib.smooth import twist_covariance
+
 COVISIBLE = 4  # mapped views that a further instant is matched against
 
 
@@ -60,6 +62,7 @@ def main(path: str) -> None:
         if job["camera"] or job.get("rig"):
             _adjust(best)
         told |= _model(best, root)
+        told["link"] = _weakest_link(best, bool(job.get("rig")))
         best.write_text(str(sparse))
         lap("adjusting")
         if job["place"]:
@@ -303,13 +306,55 @@ def _place(job: dict[str, Any], root: Path, database: Path, model: Any) -> dict[
         )
         if solved is None or solved["num_inliers"] < 8:
             continue
+        pose = np.asarray(solved["cam_from_world"].matrix())
+        good = np.asarray(solved["inlier_mask"], bool)
+        off = camera.img_from_cam(xyz[good] @ pose[:, :3].T + pose[:, 3]) - xy[good]
+        variance = float(np.sum(off**2)) / max(2 * int(good.sum()) - 6, 1)  # COLMAP's covariance is for one of 1 px^2
         placed[name] = {
-            "pose": np.asarray(solved["cam_from_world"].matrix()).tolist(),
+            "pose": pose.tolist(),
             "inliers": int(solved["num_inliers"]),
-            "cov": np.asarray(solved["covariance"]).tolist(),
+            "cov": (variance * twist_covariance(np.asarray(solved["covariance"]), pose)).tolist(),
         }
     opened.close()
     return placed
+
+
+def _weakest_link(model: Any, rigged: bool) -> dict[str, Any]:
+    """How few points hold two parts of a map together, and which views are the smaller part.
+
+    The views (the arms of a rig are one view) are joined by the strongest links: points that both see, and a third view
+    too, for two views alone say nothing of their distance against the others'. The weakest link that is needed is the
+    one along which a map bends.
+    """
+    view = {i.name: Path(i.name).name if rigged else i.name for i in model.images.values() if i.has_pose}
+    seen: dict[str, set[int]] = {name: set() for name in view.values()}
+    for key, point in model.points3D.items():
+        names = {view[name] for e in point.track.elements if (name := model.images[e.image_id].name) in view}
+        if len(names) > 2:
+            for name in names:
+                seen[name].add(key)
+    found = weakest_link(seen)
+    return found | {"views": [min(n for n, v in view.items() if v == name) for name in found["views"]]}
+
+
+def weakest_link(seen: dict[str, set[int]]) -> dict[str, Any]:
+    """The weakest edge of the strongest tree over views that see points: {"points", "views" of the smaller part}."""
+    names = sorted(seen)
+    best = {n: (len(seen[n] & seen[names[0]]), names[0]) for n in names[1:]}
+    edges: list[tuple[int, str, str]] = []
+    while best:
+        name = max(best, key=lambda n: (best[n][0], n))
+        count, other = best.pop(name)
+        edges.append((count, name, other))
+        for n in best:
+            best[n] = max(best[n], (len(seen[n] & seen[name]), name))
+    if not edges:
+        return {"points": 0, "views": names}
+    weak = min(edges)
+    part = {weak[1]}
+    while more := {n for _, a, b in edges if (a, b) != weak[1:] for n in (a, b) if {a, b} & part} - part:
+        part |= more
+    return {"points": weak[0], "views": sorted(min(part, set(names) - part, key=len))}
 
 
 def _neighbours(model: Any, mapped: dict[str, Any]) -> dict[str, list[str]]:

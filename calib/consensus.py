@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from spikerig.calib.gauge import extent, pose_errors, similarity
 from spikerig.calib.mapping import Map
-from spikerig.calib.smooth import compose, mean_pose, smooth_path
+from spikerig.calib.smooth import mean_pose, smooth_path
+from spikerig.dataset.rigid import compose, inverse, log_se3
 
 Floats = NDArray[np.float64]
 AGREE_DEG, AGREE_SHARE = 1.5, 0.03  # median rotation, and median distance over the extent, within which maps agree
@@ -18,12 +19,13 @@ AGREE_DEG, AGREE_SHARE = 1.5, 0.03  # median rotation, and median distance over 
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """A view's poses over its exposure: phases float64[M], cam_from_world [M,3,4], covariances [M,6,6], chi-square."""
+    """A view's poses over its exposure: phases float64[M], cam_from_world [M,3,4], covariances [M,6,6] of their twists,
+    and chi-square; None where nothing was measured and the camera is taken to stand still."""
 
     phases: Floats
     poses: Floats
     cov: Floats
-    chi2: float
+    chi2: float | None
 
 
 def apart_by(a: Map, b: Map) -> tuple[float, float]:
@@ -71,15 +73,44 @@ def paths_through(first: Map, best: Map, poses: Mapping[str, Floats], phases: Fl
         if len(rows) < 3:
             continue
         at, measured = np.array([r[0] for r in rows]), np.stack([r[1] for r in rows])
-        known = np.array([np.sqrt(np.maximum(np.diag(c), 0)) for _, _, c in rows[1:] if c is not None])
-        sigmas = np.concatenate([np.median(known, 0)[None], known])
-        scale = 1.0
+        known = np.array([c for _, _, c in rows[1:] if c is not None])
+        cov = np.concatenate([np.mean(known, 0)[None], known])
         if to is not None:
-            measured, scale = to.poses(measured), to.scale
-        sigmas[:, 3:] *= scale
-        smooth, cov, chi2 = smooth_path(at, measured, sigmas, np.append(phases, 0.5))
-        inverse = np.concatenate([smooth[-1][:, :3].T, -(smooth[-1][:, :3].T @ smooth[-1][:, 3])[:, None]], 1)
-        shift = compose(inverse, poses[name])  # world of the path -> world of the average, in the middle
+            measured = to.poses(measured)
+            cov = scaled(cov, to.scale)
+        smooth, cov, chi2 = smooth_path(at, measured, cov, np.append(phases, 0.5))
+        shift = compose(inverse(smooth[-1]), poses[name])  # world of the path -> world of the average, in the middle
         moved = np.stack([compose(p, shift) for p in smooth[:-1]])
         paths[name] = Path(phases, moved, cov[:-1], chi2)
     return paths
+
+
+def still_paths(paths: Mapping[str, Path], poses: Mapping[str, Floats], phases: Floats) -> dict[str, Path]:
+    """A path that stands still for each view that has none, as unsure as the other views' cameras move.
+
+    Training needs a path of every view. Nothing was measured of this one's motion; the best guess of a motion that is
+    as likely to go one way as the other is none. Its covariance says how wrong that may be: at each phase, the mean
+    square of the twists from the middle to there of the views that were measured, and their own covariance.
+
+    Args:
+        paths: measured.
+        poses: of all placed views, at mid-exposure.
+        phases: of the exposure, as of the paths.
+
+    Returns:
+        By view; empty where no view was measured, for then nothing says how far cameras move.
+    """
+    if not paths:
+        return {}
+    moves = [
+        np.array([log_se3(compose(pose, inverse(poses[name]))) for pose in path.poses]) for name, path in paths.items()
+    ]
+    spread = np.mean([np.einsum("pi,pj->pij", m, m) for m in moves], 0) + np.mean([p.cov for p in paths.values()], 0)
+    left = sorted(poses.keys() - paths.keys())
+    return {name: Path(phases, np.stack([poses[name]] * len(phases)), spread, None) for name in left}
+
+
+def scaled(cov: Floats, scale: float) -> Floats:
+    """Covariances [N,6,6] of twists in a world that is `scale` times as large."""
+    by = np.repeat([1.0, scale], 3)
+    return cov * by[:, None] * by

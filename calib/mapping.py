@@ -65,8 +65,8 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """A picture placed in a map: cam_from_world float64[3,4], its inliers, covariance of rotation and translation, and
-    the mean residual of its features in pixels."""
+    """A picture placed in a map: cam_from_world float64[3,4], its inliers, covariance [6,6] of the twist it is off by
+    (rotation, translation; on its left), and the mean residual of its features in pixels."""
 
     pose: NDArray[np.float64]
     inliers: int
@@ -88,6 +88,7 @@ class Map:
         versions: of what made it.
         cameras: as estimated or given.
         focal: of a known camera, were it free: `ratio` to the one given, and the share of the residual `saved` by it.
+        link: how few points hold two parts of it together; None where nobody counted. `hanging`: the smaller part.
     """
 
     poses: Mapping[str, Placed] = field(default_factory=dict)
@@ -101,6 +102,8 @@ class Map:
     version: str = ""
     cameras: Mapping[str, Any] = field(default_factory=dict)
     focal: Mapping[str, float] = field(default_factory=dict)
+    link: int | None = None
+    hanging: tuple[str, ...] = ()
 
 
 def build_map(
@@ -242,5 +245,7 @@ def _map_of(told: dict[str, Any], root: Path, names: Mapping[str, str]) -> Map:
         told["version"],
         told["cameras"],
         told.get("focal", {}),
+        told["link"]["points"],
+        tuple(names[n] for n in told["link"]["views"]),
     )
     return Map(poses, placed, xyz, rgb, error, *more)

@@ -39,6 +39,9 @@ def poses(
     shared_camera: Annotated[bool, typer.Option(help="A folder's pictures are of one camera.")] = False,
     board: Annotated[str, typer.Option(help="Inner corners of a board in view, e.g. 9x6: gives millimetres.")] = "",
     square_mm: Annotated[float, typer.Option(help="Its squares.")] = 0.0,
+    rescale: Annotated[
+        bool, typer.Option("--rescale", help="Write an earlier world in metres too, by --board.")
+    ] = False,
     seed: Annotated[int, typer.Option(help="Of RANSAC and of the mapper.")] = 1,
     threads: Annotated[int, typer.Option(help="Of features and matches; 0: one a core.")] = 0,
     sheet: Annotated[Path | None, typer.Option(help="A contact sheet of the scene written (.html).")] = None,
@@ -72,7 +75,9 @@ def poses(
         listed = tuple(k for k in kinds.split(",") if k)
         wanted = Wanted(arms, listed, min(maps, len(listed)) if listed else maps, instants, min_share, off, pattern)
         sized = _board(board, square_mm)
-        told = _scene(source, out, wanted, options, write, write_to, force, sized)
+        if rescale and (sized is None or not (write or write_to)):
+            raise UsageError("--rescale needs --board, and --write or --write-to", value=source)
+        told = _scene(source, out, wanted, options, write, write_to, force, sized, rescale)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         (out / "poses.json").write_text(json.dumps(told, indent=1), encoding="utf-8")
@@ -114,6 +119,7 @@ def _scene(
     write_to: Path | None,
     force: bool,
     board: Any,
+    rescale: bool,
 ) -> dict[str, Any]:
     from dataclasses import asdict
 
@@ -146,10 +152,20 @@ def _scene(
         left_out = ("poses", "source", "seconds")
         record = {k: v for k, v in told.items() if k not in left_out} | origin
         record["versions"] |= told["versions"]
-        if size and size["mm_per_unit"]:
-            note(f"a unit of the estimate's own world is {size['mm_per_unit']:.2f} mm +- {size['sd']:.2f}")
-        told |= write_poses(source, estimate, record, out=write_to, force=force)
+        unit = size["mm_per_unit"] if size else None
+        told |= write_poses(source, estimate, record, out=write_to, force=force, mm_per_unit=unit, rescale=rescale)
+        _tell_world(told["world"], size)
     return told
+
+
+def _tell_world(world: dict[str, Any], size: dict[str, Any] | None) -> None:
+    metres, sure = world["metres_per_unit"], ""
+    if size and size["mm_per_unit"]:
+        sure = f" (+- {size['sd'] / size['mm_per_unit']:.1%}, by the board)"
+    elif size:
+        note(f"no metres by the board: {size['reason']}")
+    unit = "its unit is of no known length" if metres is None else f"its unit is {metres:.4g} m{sure}"
+    note(f"the world is that of {world['of']}; {unit}")
 
 
 def _board(pattern: str, square_mm: float) -> Any:
@@ -222,6 +238,7 @@ def report(estimate: Any, options: Any) -> dict[str, Any]:
         "error_px": None if best.error_px != best.error_px else best.error_px,
         "points": len(best.xyz),
         "free_focal": dict(best.focal) or None,
+        "weakest_link": None if best.link is None else {"points": best.link, "views": list(best.hanging)},
         "kinds": list(estimate.kinds),
         "textures": [
             {"kind": k.kind, "sharpness": k.sharpness, "noise": k.noise, "refound": k.refound, "spread_px": k.spread}
@@ -235,7 +252,8 @@ def report(estimate: Any, options: Any) -> dict[str, Any]:
             "share_of_extent": estimate.agreement_share,
         },
         "paths": len(estimate.paths),
-        "path_chi2": {n: p.chi2 for n, p in sorted(estimate.paths.items())},
+        "paths_taken_still": sorted(n for n, p in estimate.paths.items() if p.chi2 is None),
+        "path_chi2": {n: p.chi2 for n, p in sorted(estimate.paths.items()) if p.chi2 is not None},
         "observations": dict(sorted(inliers.items())),
         "residual_px": {n: p.error_px for n, p in sorted(best.poses.items()) if p.error_px is not None},
         "point_residuals": quantiles(best.error),
@@ -286,6 +304,12 @@ def _tell(told: dict[str, Any]) -> None:
     if told["truth"]:
         deg, share = told["truth"]["deg"], told["truth"]["share_of_extent"]
         note(f"against truth: {deg['median']:.2f} degrees, {100 * share['median']:.2f} % of the extent (medians)")
+    if told["paths_taken_still"]:
+        names = ", ".join(told["paths_taken_still"])
+        note(f"no path over the exposure was measured for {names}: there the camera is taken to stand still, with an")
+        note("uncertainty as large as the other views' motion")
+    if told.get("wanted", {}).get("instants", 1) > 1 and not told["paths"]:
+        note("no path over an exposure could be measured: methods that need one (average, spike-ratio) will not run")
     for name in told["not_registered"][:20]:
         note(f"not placed: {name}")
     if told.get("written"):

@@ -5,17 +5,18 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.calib.consensus import Path, agree, apart_by, averaged, paths_through
-from spikerig.calib.gauge import centres, extent
+from spikerig.calib.consensus import Path, agree, apart_by, averaged, paths_through, still_paths
+from spikerig.calib.estimate import Estimate, Wanted
 from spikerig.calib.mapping import Map, Options, build_map
 from spikerig.calib.pattern import fixed_pattern
 from spikerig.calib.pictures import KINDS, Looks, frame_picture, looks, picture_of, texture_of
+from spikerig.calib.pose_verdict import judged
 from spikerig.calib.straight import Straight
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.scene import Camera, View
@@ -24,71 +25,7 @@ from spikerig.dataset.texture import Texture
 Floats = NDArray[np.float64]
 LOOKED_AT = 6  # views on which the kinds of texture are judged
 APART = (0.2, 0.8)  # phases of the two instants that features are compared between: windows share no spike
-# A free focal length that is off by the first, and takes the second of the residual with it, says that K is wrong.
-WRONG_FOCAL = ((0.05, 0.02), (0.2, 0.003))
 HARDER = {"peak_threshold": 0.0015, "max_ratio": 0.85}
-
-
-@dataclass(frozen=True, slots=True)
-class Wanted:
-    """What to estimate, and what is good enough.
-
-    Args:
-        arms: pictures of the `spike` arm, of `rgb`, or of `both` as a COLMAP rig of fixed relative pose.
-        kinds: of texture; empty chooses by how many features are found again, and how near (sharpness and noise).
-        maps: how many kinds of texture are mapped independently; two or more can disagree, and then nothing is kept.
-        instants: poses over each exposure, ends included; 1 gives the middle alone.
-        min_share: of the views that must be placed.
-        max_error_px: mean residual above which a map is refused.
-        pattern: the sensor's fixed pattern, measured on the views themselves, is divided out of their textures.
-    """
-
-    arms: str = "spike"
-    kinds: tuple[str, ...] = ()
-    maps: int = 3
-    instants: int = 5
-    min_share: float = 0.8
-    max_error_px: float = 1.5
-    pattern: bool = True
-
-    def __post_init__(self) -> None:
-        if self.arms not in ("spike", "rgb", "both"):
-            raise UsageError("unknown arms", value=self.arms, expected="spike, rgb or both")
-        if not (1 <= self.maps <= 8 and 1 <= self.instants <= 101 and 0 < self.min_share <= 1):
-            raise UsageError(
-                "maps, instants or min_share out of range", value=(self.maps, self.instants, self.min_share)
-            )
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """Poses in a world of their own, and why to trust them or not.
-
-    Args:
-        images: names of all views asked for.
-        poses: cam_from_world [3,4] at mid-exposure, by view, of those placed.
-        paths: over the exposure, by view, of those where enough instants were.
-        best: the map they come from.
-        kinds: of texture mapped; the first is `best`'s.
-        looked: sharpness and noise of the kinds.
-        agreement_deg, agreement_share: largest median difference between the maps that agree.
-        agreeing: how many of the maps agree with the best, itself included, and how many there were.
-        reasons: why it is refused; empty when it is not.
-        pattern_sd: of the fixed pattern that was divided out (a share of the light); None: nothing was.
-    """
-
-    images: tuple[str, ...]
-    poses: Mapping[str, Floats]
-    paths: Mapping[str, Path]
-    best: Map
-    kinds: tuple[str, ...]
-    looked: tuple[Looks, ...] = ()
-    agreement_deg: float | None = None
-    agreement_share: float | None = None
-    agreeing: tuple[int, int] = (1, 1)
-    reasons: tuple[str, ...] = ()
-    seconds: Mapping[str, float] = field(default_factory=dict)
-    pattern_sd: float | None = None
 
 
 def estimate_poses(
@@ -132,7 +69,7 @@ def estimate_poses(
     if wanted.arms == "rgb":
         pictures = {v.name: frame_picture(v.frame) for v in usable}
         found = build_map(pictures, rgb_camera or camera, options, keep=keep, done=done)
-        return _judged(Estimate(names, {n: p.pose for n, p in found.poses.items()}, {}, found, ("rgb",)), wanted)
+        return judged(Estimate(names, {n: p.pose for n, p in found.poses.items()}, {}, found, ("rgb",)), wanted)
     gain = gain_of(usable) if wanted.pattern else None
     ranked = _ranked(usable, wanted, gain, straight)
     done("textures ranked")
@@ -147,7 +84,7 @@ def estimate_poses(
     if max(len(m.poses) for m in maps.values()) < enough:
         harder = replace(options, **HARDER)
         maps[f"{kinds[0]}, low contrast"] = replace(rigged, options=harder).map(kinds[0])
-    return _judged(_settled(rigged, maps, names, ranked), wanted)
+    return judged(_settled(rigged, maps, names, ranked), wanted)
 
 
 @dataclass(frozen=True, slots=True)
@@ -326,9 +263,11 @@ def _settled(rigged: _Rigged, maps: Mapping[str, Map], names: tuple[str, ...], r
     group = friends[best]
     poses = averaged([maps[k] for k in group])
     pairs = [apart[best, k] for k in group[1:]]
-    first = maps[order[0]]
-    through = rigged.wanted.instants > 1 and order[0] in group  # the first map holds the further instants
-    paths = paths_through(first, maps[best], poses, rigged.phases) if through else {}
+    paths: dict[str, Path] = {}
+    if rigged.wanted.instants > 1:
+        first = maps[order[0]] if order[0] in group else _with_instants(rigged, best)
+        paths = paths_through(first, maps[best], poses, rigged.phases)
+        paths |= still_paths(paths, poses, rigged.phases)
     kinds = (best, *(k for k in order if k != best))
     seconds: dict[str, float] = {}
     for found in maps.values():
@@ -350,32 +289,8 @@ def _settled(rigged: _Rigged, maps: Mapping[str, Map], names: tuple[str, ...], r
     )
 
 
-def _judged(found: Estimate, wanted: Wanted) -> Estimate:
-    """The estimate with the reasons against it."""
-    reasons = []
-    placed, asked = len(found.poses), len(found.images)
-    if placed < max(3, wanted.min_share * asked):
-        lost = ", ".join(sorted(set(found.images) - found.poses.keys())[:12])
-        reasons.append(f"only {placed} of {asked} views were placed ({wanted.min_share:.0%} asked for); not: {lost}")
-    if placed and not found.best.error_px <= wanted.max_error_px:
-        reasons.append(f"the mean residual is {found.best.error_px:.2f} px, more than {wanted.max_error_px:g}")
-    focal = found.best.focal
-    if any(abs(focal["ratio"] - 1) > off and focal["saved"] > saved for off, saved in WRONG_FOCAL if focal):
-        reasons.append(
-            f"the map asks for {focal['ratio']:.2f} times the focal length given ({focal['saved']:.0%} less residual): "
-            "wrong intrinsics, or a bent map"
-        )
-    if found.agreeing[1] > 1 and found.agreeing[0] < 2:
-        reasons.append(f"{found.agreeing[1]} kinds of texture give maps that differ: none is to be trusted")
-    if placed >= 3:
-        stack = np.stack(list(found.poses.values()))
-        depth = _depth(found.best, stack)
-        if depth > 0 and extent(stack) < 1e-3 * depth:
-            reasons.append("the camera did not move: all views stand at one place")
-    return replace(found, reasons=tuple(reasons))
-
-
-def _depth(found: Map, stack: Floats) -> float:
-    if not len(found.xyz):
-        return 0.0
-    return float(np.median(np.linalg.norm(found.xyz[None, :2000] - centres(stack)[:, None], axis=2)))
+def _with_instants(rigged: _Rigged, name: str) -> Map:
+    """The map of that name once more, with the further instants: the map that had them is not to be trusted."""
+    kind, _, low = name.partition(", ")
+    again = replace(rigged, options=replace(rigged.options, **HARDER)) if low else rigged
+    return again.map(kind, first=True)

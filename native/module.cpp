@@ -11,6 +11,7 @@ void bind_spikes(nb::module_ &m);
 void bind_events(nb::module_ &m);
 void bind_train(nb::module_ &m);
 void bind_light(nb::module_ &m);
+void bind_fields(nb::module_ &m);
 
 NB_MODULE(_native, m) {
   m.doc() = "spikerig's native kernels. Call them through dataset.kernels and train.kernels, which check shapes.";
@@ -23,4 +24,5 @@ NB_MODULE(_native, m) {
   bind_events(m);
   bind_train(m);
   bind_light(m);
+  bind_fields(m);
 }

@@ -1,6 +1,7 @@
 """Hard cases of GoPro clips and of the GoPro's wire."""
 
 _FILE, _WIRE, _CAMERA = "dataset/test_gopro_file.py", "rigctl/test_gopro_wire.py", "rigctl/test_gopro.py"
+_WEB = "rigctl/test_gopro_web.py"
 
 ROWS = [
     ("sizes, counts and offsets of 0, 2^31, 2^63, 2^64 - 1; boxes 10,000 deep; moov missing, twice, cut off",
@@ -18,13 +19,13 @@ ROWS = [
      f"{_FILE}::test_chapters_whose_stamps_begin_anew_follow_each_other"),
     ("offsets beyond 4 GB", "read_movie", "the bytes at that place", f"{_FILE}::test_long_offsets_are_read"),
     ("type strings that swell to 10^9 columns", "gpmf.streams", "a DataError, nothing allocated",
-     f"{_FILE}::test_a_type_that_swells_is_refused"),
+     "dataset/test_gpmf.py::test_a_type_that_swells_is_refused"),
     ("packets lost, repeated, swapped, cut, too long, empty", "Assembler", "no message, and the next one is heard",
      f"{_WIRE}::test_damaged_packets_never_make_a_message"),
     ("random packets", "Assembler", "no exception", f"{_WIRE}::test_random_packets_never_raise"),
-    ("JSON that is none, or 100,000 deep", "Web", "a DeviceError", f"{_WIRE}::test_answers_that_are_none"),
+    ("JSON that is none, or 100,000 deep", "Web", "a DeviceError", f"{_WEB}::test_answers_that_are_none"),
     ("downloads that break after any byte, servers that ignore ranges", "Web.download", "the whole file, bit for bit",
-     f"{_WIRE}::test_a_download_that_breaks_off_goes_on"),
+     f"{_WEB}::test_a_download_that_breaks_off_goes_on"),
     ("the answer to the shutter is lost", "GoProSource", "one recording, not two",
      f"{_CAMERA}::test_a_lost_answer_to_the_shutter_is_decided_by_the_state"),
     ("settings taken without effect", "verify_clip", "each found in the clip",

@@ -67,4 +67,28 @@ ROWS = [
         "exit 2, 2, 4",
         "calib/test_pose_folder.py::test_folders_that_are_refused",
     ),
+    (
+        "two groups of views held together by few points",
+        "weakest_link, judged",
+        "refused below 35; below 60 unless all maps agree",
+        POSES + "test_the_weakest_link_is_that_of_the_strongest_tree",
+    ),
+    (
+        "a camera that turns by up to 150 degrees within an exposure",
+        "smooth_path",
+        "a curve of the spline's kind is met to 1e-8; covariances positive definite",
+        "calib/test_smooth.py::test_a_known_curve_is_met_between_its_instants",
+    ),
+    (
+        "a view of which no path could be measured",
+        "still_paths",
+        "it stands still, as unsure as the other views move",
+        "calib/test_smooth.py::test_a_view_without_a_path_stands_still_and_unsure",
+    ),
+    (
+        "a take whose views all have one pose",
+        "write_poses",
+        "the map's own world, in metres by the board; views not mapped are left out",
+        "calib/test_posed_scene.py::test_a_take_without_poses_gets_the_maps_world",
+    ),
 ]

@@ -85,7 +85,7 @@ ROWS = [
         "pickles and foreign records for a finished view",
         "shelf.loads",
         "DataError",
-        DATASET + "test_foreign_views_are_refused",
+        "rigctl/test_shelf.py::test_foreign_views_are_refused",
     ),
     (
         "workers with another CPU, NumPy or spikerig",

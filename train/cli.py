@@ -22,8 +22,8 @@ def fit(
         typer.Option(help="Loss and camera model: plain, average, spikenerf, spikenerf-5x, spike-ratio, "
                      "spike-hybrid, oracle."),
     ] = "plain",
-    field: Annotated[str, typer.Option(help="The model: splat.")] = "splat",
-    preset: Annotated[str, typer.Option(help="Effort: draft, standard, full.")] = "standard",
+    field: Annotated[str, typer.Option(help="The model: splat, nerf (the paper's), nerf-fast (hash grid).")] = "splat",
+    preset: Annotated[str, typer.Option(help="Effort: draft, standard, full; paper (field nerf).")] = "standard",
     steps: Annotated[int | None, typer.Option(help="Steps; the preset's where not given.")] = None,
     seconds: Annotated[float | None, typer.Option(help="Train for so long instead; scoring and saving aside.")] = None,
     splats: Annotated[int | None, typer.Option(help="How many, and at most.")] = None,

@@ -6,14 +6,15 @@ all loss terms are means over pixels, textures in [0,1] where 1 is display white
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 from spikerig.dataset.errors import UsageError
+from spikerig.train.raypresets import FAST, NERF, nerf, nerf_fast
 
 CHOICES: dict[str, tuple[str, ...]] = {
-    "field": ("splat",),
+    "field": ("splat", "nerf", "nerf-fast"),
     "init": ("points", "random"),
     "background": ("black", "white", "random"),
     "densify": ("off", "mcmc"),
@@ -30,6 +31,13 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "device": ("cpu", "cuda"),
 }
 PAPER_BATCH = 1024
+SPLAT_ONLY = {
+    "splats", "init", "init_opacity", "init_scale", "antialias", "densify", "densify_every", "densify_until", "noise",
+    "opacity_reg", "scale_reg", "sh_warmup", "ssim_weight", "fresh_poses", "lr_means", "lr_scales", "lr_quats",
+    "lr_opacities", "lr_colours",
+}  # fmt: skip
+FAST_ONLY = {"grid_levels", "coarsest", "finest", "table_log2", "occupancy", "lr_grid"}
+RAYS_ONLY = {"rays", "views_per_step", "coarse", "fine", "width", "lr_net", *FAST_ONLY}
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +47,11 @@ class FitConfig:
     Model: `splats` is the number to start with (points are thinned or duplicated to it) and the cap of densification;
     learning rates are per step at the start of the run and fall exponentially to `lr_end` times that, by the fraction
     of steps done, or of seconds spent where `seconds` > 0. `lr_means` is in units of the normalised scene ([-1, 1]).
+
+    Rays (fields nerf and nerf-fast): a step draws `rays` pixels, from `views_per_step` views in equal shares. `coarse`
+    and `fine` are samples a ray: of the two networks of nerf; for nerf-fast the places looked up in the occupancy grid,
+    and those the network sees. `width` is that of the hidden layers; `grid_levels` levels of a hash grid go from
+    `coarsest` to `finest` cells along an axis with at most 2^`table_log2` rows each; `occupancy` cells along an axis.
 
     Camera: a blurry frame is explained by `poses_per_view` sub-poses of its exposure, averaged in linear light. One
     sub-pose is the instant of `pose_label` (the paper does not say which). More lie at (j+1/2)/n of the exposure
@@ -80,6 +93,17 @@ class FitConfig:
     noise: float = 5e4
     opacity_reg: float = 0.0
     scale_reg: float = 0.0
+    # rays
+    rays: int = 1024
+    views_per_step: int = 1
+    coarse: int = 64
+    fine: int = 128
+    width: int = 256
+    grid_levels: int = 12
+    coarsest: int = 16
+    finest: int = 512
+    table_log2: int = 16
+    occupancy: int = 64
     # rates
     lr_means: float = 4e-4
     lr_scales: float = 3e-2
@@ -87,6 +111,8 @@ class FitConfig:
     lr_opacities: float = 3e-2
     lr_colours: float = 1e-2
     lr_gray: float = 1e-3
+    lr_net: float = 5e-4
+    lr_grid: float = 1e-2
     lr_end: float = 0.3
     # colour term and camera
     colour_target: str = "frame"
@@ -125,6 +151,7 @@ class FitConfig:
 
     def _range_faults(self) -> list[tuple[bool, str]]:
         positive = ("steps", "splats", "densify_every", "poses_per_view", "textures_per_view", "texture_window")
+        positive += ("rays", "views_per_step", "coarse", "fine", "width")
         rates = [f.name for f in fields(self) if f.name.startswith("lr_")]
         return [
             *((getattr(self, name) < 1, f"{name} must be at least 1") for name in (*positive, "ratio_instants")),
@@ -142,7 +169,21 @@ class FitConfig:
             ),
             (self.ratio_eps <= 0, "ratio_eps must be positive"),
             (not 0 < self.ratio_min <= 1 <= self.ratio_max, "ratio_min <= 1 <= ratio_max must hold"),
+            *self._ray_faults(),
             (self.pose_label == "first" and self.colour_target == "truth", "the truth is not labelled by pose_label"),
+        ]
+
+    def _ray_faults(self) -> list[tuple[bool, str]]:
+        if self.field == "splat":
+            return []
+        return [
+            (self.colour_loss != "l2", "a batch of rays has no neighbours for SSIM: colour_loss must be l2"),
+            (self.fresh_poses > 0, "renders of single rays are not remembered: fresh_poses must be 0"),
+            (self.densify != "off", "only splats densify"),
+            (self.views_per_step > self.rays, "views_per_step must not exceed rays"),
+            (max(self.coarse, self.fine, self.width) > 4096, "coarse, fine and width are at most 4096"),
+            (self.rays > 1 << 20, "rays is at most 2^20"),
+            (not 4 <= self.occupancy <= 512, "occupancy must be 4 to 512"),
         ]
 
     @property
@@ -201,7 +242,17 @@ def full() -> FitConfig:
     return replace(standard(), preset="full", steps=30_000, splats=100_000, sh_degree=3, antialias=True, lr_end=0.03)
 
 
-PRESETS: dict[str, Callable[[], FitConfig]] = {"draft": draft, "standard": standard, "full": full}
+def paper() -> FitConfig:
+    """Field nerf as the paper has it: 200,000 steps of 1024 rays; weeks on a CPU, hours on a GPU."""
+    return FitConfig(preset="paper", steps=200_000)
+
+
+PRESETS: dict[str, Callable[[], FitConfig]] = {"draft": draft, "standard": standard, "full": full, "paper": paper}
+FIELDS: dict[str, tuple[Callable[[str], dict[str, Any]], Collection[str]]] = {  # settings by preset, presets
+    "splat": (lambda preset: {}, ("draft", "standard", "full")),
+    "nerf": (nerf, NERF),
+    "nerf-fast": (nerf_fast, FAST),
+}
 
 
 def plain(config: FitConfig) -> FitConfig:
@@ -264,20 +315,27 @@ METHODS: dict[str, Callable[[FitConfig], FitConfig]] = {
 }
 
 
-def configure(method: str = "plain", preset: str = "standard", **changes: Any) -> FitConfig:
-    """The config of a method at a preset, with changes by name.
+def configure(method: str = "plain", preset: str = "standard", field: str = "splat", **changes: Any) -> FitConfig:
+    """The config of a method at a preset on a field, with changes by name.
 
     Raises:
-        UsageError: an unknown method, preset, setting or value.
+        UsageError: an unknown method, preset, field, setting or value; a setting of another field; what makes no sense.
     """
-    for name, value, table in (("method", method, METHODS), ("preset", preset, PRESETS)):
+    for name, value, table in (("method", method, METHODS), ("preset", preset, PRESETS), ("field", field, FIELDS)):
         if value not in table:
             raise UsageError(f"no such {name}", value=value, expected=", ".join(table))
-    config = METHODS[method](PRESETS[preset]())
-    known = {f.name for f in fields(config)}
+    shape, presets = FIELDS[field]
+    if preset not in presets:
+        raise UsageError(f"field {field} has no such preset", value=preset, expected=", ".join(presets))
+    known = {f.name for f in fields(FitConfig)}
     if strange := sorted(set(changes) - known):
         raise UsageError("no such setting", value=", ".join(strange), expected=", ".join(sorted(known)))
-    return replace(config, **changes)
+    other = {"splat": RAYS_ONLY, "nerf": SPLAT_ONLY | FAST_ONLY | {"sh_degree"}, "nerf-fast": SPLAT_ONLY}[field]
+    if strange := sorted(set(changes) & other):
+        raise UsageError(
+            f"field {field} has no use for these settings", value=", ".join(strange), next="leave them out"
+        )
+    return replace(METHODS[method](PRESETS[preset]()), **(shape(preset) | changes))
 
 
 def parse_setting(text: str) -> tuple[str, Any]:

@@ -1,8 +1,9 @@
-"""The loop: views -> loss -> splats. Same seed and steps give the same bits for any thread count, resumed or not.
+"""The loop: views -> loss -> field. Same seed and steps give the same bits for any thread count, resumed or not.
 
 How that is kept: the kernels' sums have a fixed order; torch is held to one thread (its own reductions and chunked
-elementwise ops are not independent of the count); every draw comes from (seed, step), so there is no generator whose
-state could be lost; the checkpoint holds parameters, Adam's moments, step, and history.
+elementwise ops are not independent of the count; field nerf, all torch, has the kernels' count and keeps its bits at
+that count); every draw comes from (seed, step), so there is no generator whose state could be lost; the checkpoint
+holds parameters, Adam's moments, the field's grids, step, and history.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -23,22 +24,17 @@ from spikerig.dataset.scene import Camera
 from spikerig.train import checkpoint
 from spikerig.train.adam import update
 from spikerig.train.config import FitConfig, effective_weight
-from spikerig.train.densify import jolt, relocate
+from spikerig.train.field import Field, Model, Step, Tensors
+from spikerig.train.fields import field_of
 from spikerig.train.gauge import Gauge
 from spikerig.train.losses import average_exposure, l2_loss, light_of, mean_weights, tfs_loss
-from spikerig.train.model import BACKGROUNDS, Model, splats_of
+from spikerig.train.model import BACKGROUNDS
 from spikerig.train.ssim import l1_ssim
 from spikerig.train.targets import Targets, TrainView
 
-RATES = {
-    "means": "lr_means",
-    "quats": "lr_quats",
-    "log_scales": "lr_scales",
-    "logit_opacities": "lr_opacities",
-    "sh": "lr_colours",
-    "gray": "lr_gray",
-}
-HIGHER_SH = 1 / 20  # learning rate of the view-dependent coefficients, of the constant one's
+if TYPE_CHECKING:
+    from spikerig.dataset.scene import Points
+
 CHECK_EVERY = 50  # steps between looks for values that are not finite
 
 
@@ -46,6 +42,7 @@ CHECK_EVERY = 50  # steps between looks for values that are not finite
 class State:
     """What a fit changes: parameters and Adam's moments by name, the next step, seconds trained, held-out dB over time.
 
+    `grids`: what the field keeps beside its parameters.
     `memory`: linear light (float16[H,W,3]) of the last renders of sub-poses by (view, phase), where fresh_poses asks.
     """
 
@@ -55,6 +52,7 @@ class State:
     seconds: float = 0.0
     history: list[dict[str, Any]] = field(default_factory=list)
     memory: dict[tuple[str, float], Tensor] = field(default_factory=dict)
+    grids: Tensors = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,29 +66,36 @@ class Task:
     gray: Tensor
 
     @property
+    def field(self) -> Field:
+        """What is fitted."""
+        return field_of(self.config)
+
+    @property
     def weight(self) -> float:
         """Mean-equivalent weight of the TfS term."""
         pixels = self.camera.width * self.camera.height
         return effective_weight(self.config.tfs_weight, self.config.weight_reading, pixels)
 
-    def model(self, params: dict[str, Tensor]) -> Model:
+    def model(self, state: State) -> Model:
         """The model of the current parameters."""
-        return Model(splats_of(params), self.gauge, self.camera, self.config)
+        return self.field.model(state.params, state.grids, self.gauge, self.camera, self.config)
 
 
-def new_state(params: dict[str, Tensor], task: Task) -> State:
-    """Step 0: the given splats, and the gray converter where it is learned."""
+def new_state(points: Points | None, task: Task) -> State:
+    """Step 0: the field's start, and the gray converter where it is learned."""
+    params, grids = task.field.start(points, task.gauge, task.config)
     if task.config.gray == "learned" and task.targets.gray is not None:
         params = {**params, "gray": task.gray}
     leaves = {name: p.detach().clone().requires_grad_() for name, p in params.items()}
-    return State(leaves, {name: (torch.zeros_like(p), torch.zeros_like(p)) for name, p in params.items()})
+    moments = {name: (torch.zeros_like(p), torch.zeros_like(p)) for name, p in params.items()}
+    return State(leaves, moments, grids=grids)
 
 
 @contextmanager
-def one_torch_thread() -> Iterator[None]:
-    """Hold torch to one thread inside: its elementwise ops and sums depend on the count in the last bits."""
+def torch_threads(count: int = 1) -> Iterator[None]:
+    """Hold torch to some threads inside: its elementwise ops and sums depend on the count in the last bits."""
     before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    torch.set_num_threads(count)
     try:
         yield
     finally:
@@ -116,7 +121,7 @@ def train(
     Raises:
         NumericsError: a loss or parameter stopped being finite; names step, tensor and index.
     """
-    with one_torch_thread():
+    with torch_threads(task.field.torch_threads()):
         while (fraction := fraction_done(state, task.config)) < 1:
             begin = time.perf_counter()
             loss = one_step(state, task, fraction)
@@ -131,64 +136,73 @@ def fraction_done(state: State, config: FitConfig) -> float:
 
 
 def one_step(state: State, task: Task, fraction: float) -> float:
-    """One view, one update; returns the loss. Random draws: view order by epoch, the rest by step."""
-    config = task.config
+    """One look, one update; returns the loss. Random draws: view order by epoch, the rest by step."""
+    config, field = task.config, task.field
     rng = np.random.default_rng((config.seed, 2, state.step))
-    count = len(task.targets.views)
-    order = np.random.default_rng((config.seed, 3, state.step // count)).permutation(count)
-    view = task.targets.views[order[state.step % count]]
+    view = field.look(task.targets, task.camera, config, state.step, rng)
     for p in state.params.values():
         p.grad = None
-    loss = view_loss(state, task, view, fraction, rng)
-    value = loss.item()
-    if not np.isfinite(value):
-        raise _not_finite(state, f"the loss of view '{view.name}' is {value}")
-    loss.backward()
-    _descend(state, config, fraction)
-    if state.step % CHECK_EVERY == 0:
-        check_finite(state)
-    if config.densify == "mcmc":
-        _mcmc(state, config, fraction, rng)
-    state.step += 1
-    return value
-
-
-def view_loss(state: State, task: Task, view: TrainView, fraction: float, rng: np.random.Generator) -> Tensor:
-    """The whole loss of one view: colour term, TfS term, regularisers."""
-    config, targets = task.config, task.targets
     background = BACKGROUNDS[config.background]
     if config.background == "random":
         r, g, b = rng.uniform(0, 1, 3)
         background = (r, g, b)
-    degree = min(config.sh_degree, int(fraction / max(config.sh_warmup, 1e-9) * (config.sh_degree + 1)))
-    model = task.model(state.params)
+    step = Step(state.step, fraction, background, rng)
+    loss = view_loss(state, task, view, step)
+    value = loss.item()
+    if not np.isfinite(value):
+        raise _not_finite(state, f"the loss of view '{view.name}' is {value}")
+    if loss.requires_grad:
+        loss.backward()
+    _descend(state, task, fraction)
+    if state.step % CHECK_EVERY == 0:
+        check_finite(state)
+    field.tend(state, config, step)
+    state.step += 1
+    return value
 
-    def draw(phase: float) -> Tensor:
-        image = model.draw(view.instants[phase].pose, background, degree).image
+
+def view_loss(state: State, task: Task, view: TrainView, step: Step) -> Tensor:
+    """The whole loss of one view: colour term and TfS term of each of the field's renders, regularisers."""
+    config, targets = task.config, task.targets
+    model = task.model(state)
+
+    def draw(phase: float) -> list[Tensor]:
+        images = task.field.draw(model, view, phase, step)
         if config.fresh_poses > 0:
-            state.memory[view.name, phase] = light_of(image).half()
-        return image
+            state.memory[view.name, phase] = light_of(images[0]).half()
+        return images
 
-    if fraction < config.ratio_until:
-        phase = targets.ratio[rng.integers(len(targets.ratio))]
-        pictures = {phase: draw(phase)}
-        loss = colour_loss(pictures[phase], view.instants[phase].ratio.float(), view.valid, config)
+    ratio = None
+    if step.fraction < config.ratio_until:
+        ratio = targets.ratio[step.rng.integers(len(targets.ratio))]
+        drawn = {ratio: draw(ratio)}
     else:
-        pictures = {phase: draw(phase) for phase in _fresh(state, task, view, rng)}
-        drawn = [pictures[p] for p in targets.colour if p in pictures]
-        if drawn:
-            kept = [state.memory[view.name, p] for p in targets.colour if p not in pictures]
-            others = sum((light.float() for light in kept[1:]), kept[0].float()) if kept else None
-            exposed = average_exposure(drawn, others, len(targets.colour))
-            loss = len(targets.colour) / len(drawn) * colour_loss(exposed, view.frame, view.valid, config)
-        else:  # only an instant with textures and no part in the average
-            loss = torch.zeros(())
+        drawn = {phase: draw(phase) for phase in _fresh(state, task, view, step.rng)}
+    losses = [
+        _pictures_loss(state, task, view, {phase: images[k] for phase, images in drawn.items()}, ratio)
+        for k in range(len(next(iter(drawn.values()))))
+    ]
+    losses += task.field.regularise(state.params, config)
+    return sum(losses[1:], losses[0])
+
+
+def _pictures_loss(
+    state: State, task: Task, view: TrainView, pictures: dict[float, Tensor], ratio: float | None
+) -> Tensor:
+    """Colour and TfS terms of one render at each instant; `ratio` is the instant of a ratio target."""
+    config, targets = task.config, task.targets
+    drawn = [pictures[p] for p in targets.colour if p in pictures]
+    if ratio is not None:
+        loss = colour_loss(pictures[ratio], view.instants[ratio].ratio.float(), view.valid, config)
+    elif drawn:
+        kept = [state.memory[view.name, p] for p in targets.colour if p not in pictures]
+        others = sum((light.float() for light in kept[1:]), kept[0].float()) if kept else None
+        exposed = average_exposure(drawn, others, len(targets.colour))
+        loss = len(targets.colour) / len(drawn) * colour_loss(exposed, view.frame, view.valid, config)
+    else:  # only an instant with textures and no part in the average
+        loss = torch.zeros(())
     if task.weight > 0:
         loss = loss + task.weight * _tfs_term(state, task, view, pictures)
-    if config.opacity_reg > 0:
-        loss = loss + config.opacity_reg * torch.sigmoid(state.params["logit_opacities"]).mean()
-    if config.scale_reg > 0:
-        loss = loss + config.scale_reg * torch.exp(state.params["log_scales"]).mean()
     return loss
 
 
@@ -219,23 +233,13 @@ def colour_loss(image: Tensor, target: Tensor, valid: Tensor | None, config: Fit
     return l1_ssim(image, target, ssim_weight=config.ssim_weight, valid=valid)
 
 
-def _descend(state: State, config: FitConfig, fraction: float) -> None:
+def _descend(state: State, task: Task, fraction: float) -> None:
+    config = task.config
     decay = config.lr_end ** min(fraction, 1.0)
     for name, p in state.params.items():
-        rate = getattr(config, RATES[name]) * decay
-        rest = rate * HIGHER_SH if name == "sh" else None
-        update(p, state.moments[name], state.step + 1, rate, head=3, rest=rest)
-
-
-def _mcmc(state: State, config: FitConfig, fraction: float, rng: np.random.Generator) -> None:
-    splats = {n: p for n, p in state.params.items() if n != "gray"}
-    if state.step > 0 and state.step % config.densify_every == 0 and fraction < config.densify_until:
-        with torch.no_grad():
-            splats, moments = relocate(splats, {n: state.moments[n] for n in splats}, config.splats, rng)
-        state.params |= {n: p.detach().requires_grad_() for n, p in splats.items()}
-        state.moments |= moments
-        splats = {n: state.params[n] for n in splats}
-    jolt(splats, config.noise * config.lr_means * config.lr_end**fraction, rng)
+        base, share = (config.lr_gray, None) if name == "gray" else task.field.rates(name, config)
+        rate = base * decay
+        update(p, state.moments[name], state.step + 1, rate, head=3, rest=None if share is None else rate * share)
 
 
 def check_finite(state: State) -> None:
@@ -267,6 +271,7 @@ def save_state(path: Path, state: State, config: FitConfig) -> None:
     tensors: dict[str, Tensor] = {f"param/{n}": p for n, p in state.params.items()}
     for name, (mean, square) in state.moments.items():
         tensors |= {f"adam/{name}/mean": mean, f"adam/{name}/square": square}
+    tensors |= {f"grid/{n}": g for n, g in state.grids.items()}
     tensors |= {f"memory/{view}/{phase!r}": image for (view, phase), image in state.memory.items()}
     record = {"step": state.step, "seconds": state.seconds, "history": state.history, "config": config.as_json()}
     checkpoint.save(path, tensors, record)
@@ -278,6 +283,7 @@ def load_state(path: Path) -> tuple[State, dict[str, Any]]:
     leaves = {n.removeprefix("param/"): p.requires_grad_() for n, p in tensors.items() if n.startswith("param/")}
     moments = {name: (tensors[f"adam/{name}/mean"], tensors[f"adam/{name}/square"]) for name in leaves}
     state = State(leaves, moments, int(record["step"]), float(record["seconds"]), list(record["history"]))
+    state.grids = {n.removeprefix("grid/"): g for n, g in tensors.items() if n.startswith("grid/")}
     for name, image in tensors.items():
         if name.startswith("memory/"):
             _, view, phase = name.split("/")

@@ -174,6 +174,15 @@ def _check(faults: list[str], path: Path, what: str) -> None:
         raise DataError(f"these are not the weights of {what}", value=path, expected="; ".join(faults[:6]) + more)
 
 
+def _alex(x: torch.Tensor, i: int, weight: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
+    x = F.max_pool2d(x, 3, 2) if i in (3, 6) else x
+    return F.relu(F.conv2d(x, weight, bias, stride=4 if i == 0 else 1, padding={0: 2, 3: 2}.get(i, 1)))
+
+
+def _vgg(x: torch.Tensor, i: int, weight: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
+    return F.relu(F.conv2d(F.max_pool2d(x, 2) if i in POOL_BEFORE else x, weight, bias, padding=1))
+
+
 def _lpips_of(found: Tensors, path: Path) -> tuple[Any, str]:
     found = {re.sub(r"^net\.slice\d\.", "net.", k): t for k, t in found.items()}
     first = found.get("net.0.weight")
@@ -192,13 +201,7 @@ def _lpips_of(found: Tensors, path: Path) -> tuple[Any, str]:
         x = (x - torch.tensor(SHIFT).view(1, 3, 1, 1)) / torch.tensor(SCALE).view(1, 3, 1, 1)
         out = []
         for i, weight, bias in layers:
-            if alex:
-                x = F.max_pool2d(x, 3, 2) if i in (3, 6) else x
-                x = F.conv2d(x, weight, bias, stride=4 if i == 0 else 1, padding={0: 2, 3: 2}.get(i, 1))
-            else:
-                x = F.max_pool2d(x, 2) if i in POOL_BEFORE else x
-                x = F.conv2d(x, weight, bias, padding=1)
-            x = F.relu(x)
+            x = (_alex if alex else _vgg)(x, i, weight, bias)
             if i in taps:
                 out.append(x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10))
         return out
@@ -228,8 +231,7 @@ def _rankiqa_of(found: Tensors, path: Path) -> tuple[Any, str]:
 
     def score(x: torch.Tensor) -> torch.Tensor:
         for i, weight, bias in convs:
-            x = F.max_pool2d(x, 2) if i in POOL_BEFORE else x
-            x = F.relu(F.conv2d(x, weight, bias, padding=1))
+            x = _vgg(x, i, weight, bias)
         x = F.max_pool2d(x, 2).flatten(1)
         for n, (weight, bias) in enumerate(ends):
             x = F.linear(x, weight, bias)

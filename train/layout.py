@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.errors import DataError
 from spikerig.dataset.posed import pose_from_opengl
+from spikerig.dataset.rigid import inverse
 from spikerig.dataset.scene import Camera, Floats
-from spikerig.train.trajectory import inverse
 
 FILE = "transforms.json"
 

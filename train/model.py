@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,13 +14,14 @@ from spikerig.dataset.scene import Camera, Floats
 from spikerig.train.config import FitConfig
 from spikerig.train.gauge import Gauge
 from spikerig.train.splat import Rendered, Splats, render
+from spikerig.train.start import SH0
 
 NEAR = 0.02  # of the gauge's unit: nearer splats blow up under projection
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": (0.0, 0.0, 0.0)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Model:
+class SplatModel:
     """Splats in a gauge, seen by one camera."""
 
     splats: Splats
@@ -56,6 +57,30 @@ class Model:
         with torch.no_grad():
             pose = torch.from_numpy(self.gauge.pose(np.asarray(cam_from_world, np.float64)))
             return self.draw(pose).image.cpu().numpy()
+
+    def depth(self, cam_from_world: Floats) -> np.ndarray:
+        """Depth along z [H,W], world units: splats' depths blended like colours; inf where alpha is below a half."""
+        pose = self.gauge.pose(cam_from_world)
+        with torch.no_grad():
+            z = self.splats.means @ torch.from_numpy(pose[2, :3]) + float(pose[2, 3])
+            far = max(float(z.max()), 1e-6)
+            sh = (z / far)[:, None, None].expand(-1, 1, 3).sub(0.5).div(SH0).contiguous()
+            flat = replace(self, splats=replace(self.splats, sh=sh), config=replace(self.config, background="black"))
+            drawn = flat.draw(torch.from_numpy(pose))
+            alpha = drawn.alpha.cpu().numpy()
+            depth = drawn.image[:, :, 0].cpu().numpy() / np.maximum(alpha, 0.5) * (far / self.gauge.scale)
+        return np.where(alpha >= 0.5, depth, np.inf).astype(np.float32)
+
+    def middle(self) -> Floats:
+        """The splats' middle [3] by opacity, world units."""
+        with torch.no_grad():
+            weight = torch.sigmoid(self.splats.logit_opacities)[:, None]
+            middle = ((self.splats.means * weight).sum(0) / weight.sum()).cpu().numpy()[None].astype(np.float64)
+        return self.gauge.world(middle)[0]
+
+    def seen_by(self, camera: Camera) -> SplatModel:
+        """The same splats for another camera."""
+        return replace(self, camera=camera)
 
 
 def renderer(device: str) -> Callable[..., Rendered]:

@@ -170,7 +170,7 @@ def measure(
     rows = _all(pairs, lambda pair: _row(pair[0], pair[1], judges, ssim, background))
     return {
         "pictures": rows,
-        "mean": _means(rows),
+        "mean": means(rows),
         "judges": judges.about(),
         "measures": {name: about for name, (about, _) in MEASURES.items()},
         "reference": None if reference is None else str(reference),
@@ -239,7 +239,7 @@ def _all(items: Sequence[Any], work: Callable[[Any], Any]) -> list[Any]:
     raise kind(f"{len(faults)} of {len(items)} pictures cannot be measured", value=told + more, next="; ".join(nexts))
 
 
-def _means(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def means(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Mean of each number over the pictures that have one, and over how many; infinite values are left out."""
     names = [*MEASURES, "brisque", "rankiqa", "psnr", "ssim", "luma_psnr", "chroma_psnr", "lpips"]
     out: dict[str, Any] = {}

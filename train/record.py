@@ -17,8 +17,9 @@ from spikerig.dataset.scene import Camera
 from spikerig.dataset.terminal import jsonable
 from spikerig.train import checkpoint
 from spikerig.train.config import FitConfig, from_json
+from spikerig.train.field import Model
+from spikerig.train.fields import field_of
 from spikerig.train.gauge import Gauge
-from spikerig.train.model import Model, splats_of
 
 CHECKPOINT, RECORD, HISTORY = "checkpoint.safetensors", "run.json", "history.json"
 
@@ -121,7 +122,10 @@ def open_run(folder: Path) -> Run:
         camera = Camera(record["camera"]["K"], np.zeros(0), record["camera"]["width"], record["camera"]["height"])
         centre = record["gauge"]["centre"]
         gauge = Gauge((float(centre[0]), float(centre[1]), float(centre[2])), float(record["gauge"]["scale"]))
-        splats = splats_of({k.removeprefix("param/"): v for k, v in tensors.items() if k.startswith("param/")})
+        params, grids = (
+            {k.removeprefix(kind): v for k, v in tensors.items() if k.startswith(kind)} for kind in ("param/", "grid/")
+        )
+        model = field_of(config).model(params, grids, gauge, camera, config)
     except (KeyError, TypeError, IndexError, ValueError) as error:
         raise DataError("the run's record or checkpoint is damaged", value=folder, cause=repr(error)) from error
-    return Run(folder, Model(splats, gauge, camera, config), config, record)
+    return Run(folder, model, config, record)

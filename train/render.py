@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from spikerig.dataset.errors import DataError, UsageError
+from spikerig.dataset.rigid import between, compose, exp_se3, inverse
 from spikerig.dataset.scene import Floats
 from spikerig.dataset.terminal import progress
+from spikerig.train.field import Model
 from spikerig.train.layout import FILE, Layout, frame_row, is_layout, label_of, read_layout, write_layout
-from spikerig.train.model import Model
-from spikerig.train.start import SH0
-from spikerig.train.trajectory import between, compose, exp_se3, inverse
 
 if TYPE_CHECKING:
     from spikerig.dataset.store import SceneFile
@@ -93,13 +91,13 @@ def render_path(
 
 def _layout(model: Model, layout: Layout, out: Path) -> list[str]:
     """Every picture and depth of a layout, with its transforms.json."""
-    seen = replace(model, camera=layout.camera)
+    seen = model.seen_by(layout.camera)
     for file, pose in progress(layout.pictures, "rendering", "picture"):
         (out / file).parent.mkdir(parents=True, exist_ok=True)
         _write(out / file, seen.picture(pose))
     for file, pose in layout.depths:
         (out / file).parent.mkdir(parents=True, exist_ok=True)
-        _write_exr(out / file, depth_picture(seen, pose))
+        _write_exr(out / file, seen.depth(pose))
     (out / FILE).write_text(json.dumps(layout.document, indent=1) + "\n", encoding="utf-8")
     return [*(file for file, _ in layout.pictures + layout.depths), FILE]
 
@@ -176,12 +174,8 @@ def shake(model: Model, base: Floats, length_px: float, rng: np.random.Generator
 
 
 def _depth_of_middle(model: Model, pose: Floats) -> float:
-    """Depth of the splats' weighted middle in front of the camera, at least a tenth of the gauge's unit."""
-    with torch.no_grad():
-        weight = torch.sigmoid(model.splats.logit_opacities)[:, None]
-        middle = ((model.splats.means * weight).sum(0) / weight.sum()).cpu().numpy()[None].astype(np.float64)
-    world = model.gauge.world(middle)[0]
-    return max(float(pose[2, :3] @ world + pose[2, 3]), 0.1 / model.gauge.scale)
+    """Depth of the scene's weighted middle in front of the camera, at least a tenth of the gauge's unit."""
+    return max(float(pose[2, :3] @ model.middle() + pose[2, 3]), 0.1 / model.gauge.scale)
 
 
 def _shake(
@@ -209,31 +203,17 @@ def _shake(
             _write(out / file, model.picture(pose))
             shown.append({**frame_row(file, pose), "phase": float(phase)})
         depth = f"{name}/depth.exr"
-        _write_exr(out / depth, depth_picture(model, path(label)))
+        _write_exr(out / depth, model.depth(path(label)))
         files += [s["file"] for s in shown] + [depth]
         views.append({"name": name, "split": "train", "depth": depth, "frames": shown})
     return [*files, write_layout(out, model.camera, views)]
-
-
-def depth_picture(model: Model, cam_from_world: Floats) -> NDArray[np.float32]:
-    """Depth along z [H,W], world units: the splats' depths blended like colours; inf where alpha is below a half."""
-    pose = model.gauge.pose(cam_from_world)
-    with torch.no_grad():
-        z = model.splats.means @ torch.from_numpy(pose[2, :3]) + float(pose[2, 3])
-        far = max(float(z.max()), 1e-6)
-        sh = (z / far)[:, None, None].expand(-1, 1, 3).sub(0.5).div(SH0).contiguous()
-        flat = replace(model, splats=replace(model.splats, sh=sh), config=replace(model.config, background="black"))
-        drawn = flat.draw(torch.from_numpy(pose))
-        alpha = drawn.alpha.cpu().numpy()
-        depth = drawn.image[:, :, 0].cpu().numpy() / np.maximum(alpha, 0.5) * (far / model.gauge.scale)
-    return np.where(alpha >= 0.5, depth, np.inf).astype(np.float32)
 
 
 def _write(path: Path, codes: NDArray[np.float32]) -> None:
     from spikerig.dataset.images import linear_from_srgb, write_image
 
     if not np.all(np.isfinite(codes)):
-        raise DataError("a render is not finite", value=path, next="train anew; the checkpoint holds broken splats")
+        raise DataError("a render is not finite", value=path, next="train anew; the checkpoint holds broken numbers")
     codes = np.clip(codes, 0, 1)
     pixels = np.rint(codes * 255).astype(np.uint8) if path.suffix == ".png" else linear_from_srgb(codes)
     write_image(path, pixels if path.suffix == ".png" else np.asarray(pixels, np.float32), force=True)

@@ -14,12 +14,12 @@ from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.terminal import Progress, note
 from spikerig.train import record as records
 from spikerig.train.config import FitConfig
-from spikerig.train.fit import State, Task, check_finite, load_state, new_state, one_torch_thread, save_state, train
+from spikerig.train.fields import field_of
+from spikerig.train.fit import State, Task, check_finite, load_state, new_state, save_state, torch_threads, train
 from spikerig.train.gauge import gauge_of
-from spikerig.train.model import check_pinhole, renderer
+from spikerig.train.model import SplatModel, check_pinhole
 from spikerig.train.ply import export_ply
 from spikerig.train.score import Exam, mean_psnr, novel_views
-from spikerig.train.start import start_splats
 from spikerig.train.targets import load_targets
 
 if TYPE_CHECKING:
@@ -61,9 +61,11 @@ def run_fit(
     """
     from spikerig.dataset.store import open_scene
 
-    renderer(config.device)  # a missing extra is told before minutes of preparation
+    field_of(config).check(config)  # a missing extra is told before minutes of preparation
+    if ply and config.field != "splat":
+        raise UsageError("only splats can be written as .ply", value=f"field {config.field}", next="leave out --ply")
     begin = time.monotonic()
-    with open_scene(path) as scene, one_torch_thread():
+    with open_scene(path) as scene, torch_threads():
         records.prepare_folder(out, force=force, resume=resume)
         points = scene.points if points_of is None else _points(points_of)
         task, record = prepare(scene, path, config, points)
@@ -120,7 +122,7 @@ def _start(
 ) -> State:
     path = out / records.CHECKPOINT
     if not (resume and path.exists()):
-        return new_state(start_splats(points, task.gauge, task.config), task)
+        return new_state(points, task)
     state, config = load_state(path)
     now = task.config.as_json()
     if config != now:
@@ -213,7 +215,7 @@ class _Watch:
         self.looked = fraction
         row: dict[str, Any] = {"seconds": state.seconds, "step": state.step, "fraction": fraction, "psnr": None}
         if self.exams:
-            row["psnr"] = mean_psnr(self.task.model(state.params), self.exams)
+            row["psnr"] = mean_psnr(self.task.model(state), self.exams)
         state.history.append(row)
         records.write_json(self.out / records.HISTORY, state.history)
 
@@ -234,13 +236,15 @@ def _finish(state: State, watch: _Watch, record: dict[str, Any], ply: bool) -> d
         "status": "complete",
         "steps": state.step,
         "train_seconds": state.seconds,
-        "splats": len(state.params["means"]),
+        "parameters": sum(p.numel() for p in state.params.values()),
     }
+    if "means" in state.params:
+        done["splats"] = len(state.params["means"])
     if "gray" in state.params:
         done["learned_gray"] = state.params["gray"].tolist()
     records.write_json(watch.out / records.RECORD, {**record, **done})
-    if ply:
-        model = watch.task.model(state.params)
+    model = watch.task.model(state)
+    if ply and isinstance(model, SplatModel):
         export_ply(watch.out / "splats.ply", model.splats, model.gauge, force=True)
     psnr = state.history[-1]["psnr"]
     note(

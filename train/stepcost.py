@@ -29,9 +29,8 @@ def step_cost(scene: Path, *, splats: int, steps: int) -> list[dict[str, Any]]:
     """
     from spikerig.dataset.store import open_scene
     from spikerig.train.config import configure
-    from spikerig.train.fit import new_state, one_step, one_torch_thread
+    from spikerig.train.fit import new_state, one_step, torch_threads
     from spikerig.train.run import prepare
-    from spikerig.train.start import start_splats
 
     one = configure("spikenerf", "draft", splats=splats)
     configs = {
@@ -44,13 +43,13 @@ def step_cost(scene: Path, *, splats: int, steps: int) -> list[dict[str, Any]]:
     with open_scene(scene) as file:
         tasks = {name: prepare(file, scene, config)[0] for name, config in configs.items()}
         first = tasks["spikenerf 1x"]
-        state = new_state(start_splats(file.points, first.gauge, one), first)
+        state = new_state(file.points, first)
     found: dict[str, list[tuple[float, float]]] = {name: [] for name in tasks}
     warm = 2 * len(first.targets.views)  # every view's sub-poses are remembered by then
     bar = Progress("cost step", warm + steps, "rounds")
     gc.disable()
     try:
-        with one_torch_thread():
+        with torch_threads():
             for number in range(warm + steps):
                 for name, task in tasks.items():
                     cpu, wall = time.process_time(), time.perf_counter()

@@ -45,12 +45,17 @@ class Instant:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainView:
-    """A training view: colour target float32[H,W,3] codes, valid bool[H,W] or None for all, instants by phase."""
+    """A training view: colour target float32[H,W,3] codes, valid bool[H,W] or None for all, instants by phase.
+
+    Or B pixels of some views, as pictures of B rows and one column: then `pixels` int64[B] says which (row * width +
+    column), and an instant's pose is [B,3,4].
+    """
 
     name: str
     frame: torch.Tensor
     valid: torch.Tensor | None
     instants: dict[float, Instant]
+    pixels: torch.Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +68,14 @@ class Targets:
     ratio: tuple[float, ...]
     gray: Gray | None
     remarks: tuple[str, ...] = field(default=())
+
+
+def views_of_step(targets: Targets, seed: int, step: int, count: int = 1) -> list[TrainView]:
+    """The `count` views of a step; every view comes once in each epoch, in an order drawn by seed and epoch."""
+    n = len(targets.views)
+    turns = range(step * count, (step + 1) * count)
+    orders = {epoch: np.random.default_rng((seed, 3, epoch)).permutation(n) for epoch in {k // n for k in turns}}
+    return [targets.views[orders[k // n][k % n]] for k in turns]
 
 
 def spikes_of(view: View) -> SpikeStream:

@@ -129,6 +129,48 @@ def test_poses_are_written_in_place_or_not_at_all(raw: Path, tmp_path: Path, mon
     assert verify_scene(path) == []
 
 
+POSES = """
+import spikerig.calib.poses as poses
+from spikerig.calib.mapping import Map, Placed
+
+def known(views, camera, wanted, options, **more):
+    stand = {v.name: v.pose.cam_from_world.copy() for v in views}
+    for k, pose in enumerate(stand.values()):
+        pose[0, 3] += 0.1 * k * k  # takes of tests stand at one place
+    return poses.Estimate(tuple(stand), stand, {}, Map({n: Placed(p, 50) for n, p in stand.items()}), ("tfp96",))
+
+poses.estimate_poses = known
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "function", "at"),
+    [
+        ("spikerig.calib.posed_scene", "_copy", 2),
+        ("spikerig.dataset.store_write", "_sync", 1),
+        ("spikerig.dataset.store_write", "remember", 1),
+    ],
+)
+def test_kill_9_while_poses_are_written(raw: Path, tmp_path: Path, module: str, function: str, at: int) -> None:
+    """The command itself, its poses given: between views, before the new file is on disk, before it takes its place."""
+    path = copy_of(raw, tmp_path)
+    words = ["calib", "poses", str(path), "--write"]
+    code = POSES + KILLED.format(module=module, function=function, at=at)
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, timeout=120)
+    assert done.returncode == -9, done.stderr.decode()
+    assert path.read_bytes() == raw.read_bytes()
+    assert verify_scene(path) == []
+    left = [p.name for p in tmp_path.iterdir() if p != path]
+    assert len(left) == 1
+    assert left[0].startswith(".scene.poses.")
+    if function == "_copy":
+        code = POSES + KILLED.format(module=module, function=function, at=-1)
+        again = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, timeout=120)
+        assert again.returncode == 0, again.stderr.decode()
+        with open_scene(path) as scene:
+            assert scene.info["poses"]["accepted"] is True
+
+
 def _no_space_for(path: Path) -> Callable[[str | Path, str | Path], None]:
     real = os.replace
 

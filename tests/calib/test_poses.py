@@ -11,6 +11,7 @@ from calib_worlds import moved, path, ring, turn
 from spikerig.calib.consensus import averaged, paths_through
 from spikerig.calib.gauge import degrees_apart, pose_errors
 from spikerig.calib.mapping import Map, Options, Placed
+from spikerig.calib.pose_verdict import judged
 from spikerig.calib.poses import Estimate, Wanted, estimate_poses, tick_at
 from spikerig.dataset import cli
 from spikerig.dataset.errors import UsageError
@@ -143,19 +144,34 @@ def test_paths_go_through_the_average() -> None:
 
 
 def test_reasons() -> None:
-    from spikerig.calib.poses import _judged
-
     good = made(ring(10))
     good = dataclasses.replace(good, error_px=0.3, xyz=np.random.default_rng(0).normal(size=(50, 3)))
     names = tuple(good.poses)
     poses = {n: p.pose for n, p in good.poses.items()}
-    assert _judged(Estimate(names, poses, {}, good, ("a",)), Wanted()).reasons == ()
+    assert judged(Estimate(names, poses, {}, good, ("a",)), Wanted()).reasons == ()
+    thin = dataclasses.replace(good, link=35)
+    assert judged(Estimate(names, poses, {}, thin, ("a",), agreeing=(3, 3)), Wanted()).reasons == ()
+    held = dataclasses.replace(good, link=60)
+    assert judged(Estimate(names, poses, {}, held, ("a",), agreeing=(2, 3)), Wanted()).reasons == ()
     for change, says in (
         ({"images": tuple(f"v{k}" for k in range(20))}, "only 10 of 20"),
         ({"best": dataclasses.replace(good, error_px=9.0)}, "residual"),
         ({"best": dataclasses.replace(good, error_px=float("nan"))}, "residual"),
         ({"agreeing": (1, 3)}, "differ"),
+        ({"best": dataclasses.replace(good, link=34, hanging=("v0", "v1"))}, "34 points only (views v0, v1 and"),
+        ({"best": dataclasses.replace(good, link=59), "agreeing": (2, 3)}, "all maps must agree, and 2 of 3 do"),
         ({"poses": dict.fromkeys(names, poses["v0"])}, "did not move"),
     ):
-        reasons = _judged(dataclasses.replace(Estimate(names, poses, {}, good, ("a",)), **change), Wanted()).reasons
+        reasons = judged(dataclasses.replace(Estimate(names, poses, {}, good, ("a",)), **change), Wanted()).reasons
         assert any(says in r for r in reasons), (says, reasons)
+
+
+def test_the_weakest_link_is_that_of_the_strongest_tree() -> None:
+    """Two groups of views, each held by many points, and together by seven, though more pairs share one or two."""
+    from spikerig.calib.colmap_child import weakest_link
+
+    left, right, bridge = set(range(100)), set(range(200, 290)), set(range(300, 307))
+    seen = {"a": left, "b": left | bridge, "c": left | {1000}, "d": right | bridge, "e": right | {1000}}
+    assert weakest_link(seen) == {"points": 7, "views": ["d", "e"]}
+    assert weakest_link({"a": {1}, "b": {2}, "c": {1}}) == {"points": 0, "views": ["b"]}
+    assert weakest_link({"a": {1}}) == {"points": 0, "views": ["a"]}

@@ -277,7 +277,7 @@ def test_served_asked_and_ended_by_a_signal(tmp_path, capsys):
     )
     try:
         capsys.readouterr()
-        for _ in range(100):
+        for _ in range(600):
             if cli.run(["rig", "clock", "status", "--bind", where, "--json"]) == 0:
                 told = json.loads(capsys.readouterr().out)
                 if told["clocks"][0]["state"] == "locked":

@@ -4,6 +4,7 @@ import sys
 
 import numpy as np
 import pytest
+from gopro_cameras import S, rig, wait
 from gopro_clips import clip as write
 from gopro_clips import grey, pictures
 
@@ -11,7 +12,7 @@ from spikerig.dataset.errors import DeviceError, HostError, UsageError
 from spikerig.dataset.gopro_file import open_gopro
 from spikerig.dataset.gopro_pictures import read_pictures
 from spikerig.rigctl import gopro_ble as ble
-from spikerig.rigctl.gopro import GoProSource, find
+from spikerig.rigctl.gopro import find
 from spikerig.rigctl.gopro import open_gopro as open_camera
 from spikerig.rigctl.gopro_check import verify_clip
 from spikerig.rigctl.gopro_http import Dark, Web
@@ -22,28 +23,7 @@ from spikerig.rigctl.sim.emulate import gopro_menu
 from spikerig.rigctl.sim.emulate.gopro_air import Air
 from spikerig.rigctl.sim.emulate.gopro_camera import Faults, GoProCamera, Nature
 from spikerig.rigctl.sim.emulate.gopro_web import AirWifi, WebServer
-from spikerig.rigctl.sim.emulate.oscillator import Oscillator
 from spikerig.rigctl.sim.emulate.virtual import VirtualHost
-
-S = 1_000_000_000
-
-
-def rig(folder, *, hand=False, nature=None, seed=0, settle=True, **faults):
-    """An emulated camera and its driver, on one emulated time."""
-    host = VirtualHost()
-    clock = Oscillator(offset_ns=S, ppm=43, walk=1e-8, seed=seed, name="gopro")
-    camera = GoProCamera(host, folder / "card", pictures(), clock, nature or Nature(), Faults(**faults), seed)
-    web = Web(AirWifi(WebServer(camera)), host)
-    radio = None if hand else Radio(Air(camera).dial, host)
-    source = GoProSource(host, web, radio, patience_s=8.0, say=lambda text: None)
-    if settle:
-        source.settle({})
-    return source, camera
-
-
-def wait(source, seconds):
-    source.host.sleep_until(source.host.now_ns() + round(seconds * S))
-
 
 # ---- a recording ----------------------------------------------------------------------------------------------------
 
@@ -383,54 +363,3 @@ def test_a_real_camera_is_connected_to_by_ble_or_by_hand(monkeypatch):
         open_camera(RealHost(), link="usb")
     with pytest.raises(Dark):
         open_camera(RealHost(), link="hand", address="127.0.0.1:9")
-
-
-# ---- without Bluetooth ----------------------------------------------------------------------------------------------
-
-
-def person(camera, source):
-    """Somebody who does as told, half a second to two seconds later."""
-    said = []
-
-    def say(text):
-        said.append(text)
-        on = "start" in text
-        camera.at(camera.host.now_ns() + round(1.2 * S), lambda: camera.shutter(on))
-
-    source.say = say
-    return said
-
-
-@pytest.mark.parametrize("hangs", [False, True])
-def test_by_hand_the_start_is_seen_by_http_going_dark(tmp_path, hangs):
-    source, camera = rig(tmp_path, hand=True, dark_hangs=hangs)
-    said = person(camera, source)
-    source.start()
-    wait(source, 3)
-    state = source.poll()
-    assert (state["dark"], state["encoding"], state["ended_early"]) == (True, None, False)
-    clip = source.stop()
-    (truth,) = camera.truth
-    assert len(said) == 2
-    assert clip.start_ns[0] < truth["first_true_ns"] < clip.start_ns[1]
-    assert clip.stop_ns[0] < truth["true_ns"][-1] + 3 * S
-    read = open_gopro(source.fetch(clip, tmp_path))
-    assert verify_clip(DEFAULTS, read) == []
-
-
-def test_by_hand_nobody_comes(tmp_path):
-    source, camera = rig(tmp_path, hand=True)
-    with pytest.raises(DeviceError, match="nobody pressed start"):
-        source.start()
-    assert camera.host.now_ns() > 60 * S
-    with pytest.raises(UsageError):
-        source.wake()
-    source.close()
-
-
-def test_by_hand_a_dark_camera_is_not_found(tmp_path):
-    host = VirtualHost()
-    camera = GoProCamera(host, tmp_path, pictures())
-    camera.asleep = True
-    with pytest.raises(Dark, match="WiFi"):
-        GoProSource(host, Web(AirWifi(WebServer(camera)), host))

@@ -6,8 +6,8 @@ import pytest
 
 from spikerig.dataset.errors import UsageError
 from spikerig.train.config import (
+    FIELDS,
     METHODS,
-    PRESETS,
     FitConfig,
     configure,
     effective_weight,
@@ -17,11 +17,37 @@ from spikerig.train.config import (
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("preset", PRESETS)
-def test_every_method_goes_with_every_preset_and_survives_json(method, preset):
-    config = configure(method, preset, steps=7)
-    assert (config.method, config.preset, config.steps) == (method, preset, 7)
+@pytest.mark.parametrize(("field", "preset"), [(field, p) for field, (_, presets) in FIELDS.items() for p in presets])
+def test_every_method_goes_with_every_preset_of_every_field_and_survives_json(method, field, preset):
+    config = configure(method, preset, field, steps=7)
+    assert (config.method, config.preset, config.field, config.steps) == (method, preset, field, 7)
     assert from_json(config.as_json()) == config
+
+
+def test_the_papers_preset_is_the_papers():
+    config = configure("spikenerf", "paper", "nerf")
+    assert (config.steps, config.rays, config.coarse, config.fine, config.width) == (200_000, 1024, 64, 128, 256)
+
+
+@pytest.mark.parametrize(
+    ("field", "preset", "changes", "told"),
+    [
+        ("splat", "paper", {}, "no such preset"),
+        ("nerf-fast", "paper", {}, "no such preset"),
+        ("cubes", "draft", {}, "no such field"),
+        ("nerf", "draft", {"splats": 5}, "splats"),
+        ("nerf", "draft", {"table_log2": 14}, "table_log2"),
+        ("splat", "draft", {"rays": 64}, "rays"),
+        ("nerf-fast", "draft", {"colour_loss": "l1ssim"}, "SSIM"),
+        ("nerf-fast", "draft", {"fresh_poses": 1}, "fresh_poses"),
+        ("nerf-fast", "draft", {"rays": 4, "views_per_step": 8}, "views_per_step"),
+        ("nerf-fast", "draft", {"occupancy": 4096}, "occupancy"),
+    ],
+)
+def test_what_a_field_cannot_do_is_refused(field, preset, changes, told):
+    with pytest.raises(UsageError) as caught:
+        configure("plain", preset, field, **changes)
+    assert told in str(caught.value)
 
 
 def test_all_faults_are_told_at_once():

@@ -277,3 +277,29 @@ def test_lpips_from_safetensors_is_its_definition(net, tmp_path, capsys):
     save_file(made | {name: made[name] * torch.nan}, tmp_path / "w.safetensors")
     with pytest.raises(DataError, match="not finite"):
         open_lpips(tmp_path / "w.safetensors", trust=False)
+
+
+@pytest.mark.parametrize("names", ["torchvision", "caffe"])
+def test_rankiqas_vgg16_is_found_under_both_names(names, tmp_path, monkeypatch):
+    """Constant layers, whose score is known: the last convolution's bias c, 25088 of it, through three layers."""
+    one = torch.ones(())
+    made = {}
+    for i, w, c in zip(judges.VGG_AT, judges.VGG_WIDTH, (3, *judges.VGG_WIDTH), strict=False):
+        made[f"features.{i}.weight"], made[f"features.{i}.bias"] = (0 * one).expand(w, c, 3, 3), (one * i).expand(w)
+    for k, o, n, weight in ((0, 4096, 25088, 1e-3), (3, 4096, 4096, 1e-3), (6, 1, 4096, -1e-2)):
+        made[f"classifier.{k}.weight"], made[f"classifier.{k}.bias"] = (one * weight).expand(o, n), (one / 2).expand(o)
+    if names == "caffe":
+        conv = {f"features.{i}.": f"features.conv{c}." for i, c in zip(judges.VGG_AT, judges.VGG_CAFFE, strict=True)}
+        conv |= {"classifier.0.": "classifier.fc6_m.", "classifier.3.": "classifier.fc7_m."}
+        conv |= {"classifier.6.": "classifier.fc8_m."}
+        made = {next(b + k.removeprefix(a) for a, b in conv.items() if k.startswith(a)): t for k, t in made.items()}
+    (tmp_path / "w").write_bytes(b"x")
+    monkeypatch.setattr(judges, "_tensors", lambda path: made)
+    expected = ((25088 * 28 * 1e-3 + 0.5) * 4096 * 1e-3 + 0.5) * 4096 * -1e-2 + 0.5
+    judge = open_rankiqa(tmp_path / "w", trust=False)
+    assert judge(np.zeros((224, 224, 3), np.uint8)) == pytest.approx(
+        expected, rel=1e-3
+    )  # float32 sums of 25088 equal terms
+    made.pop(next(k for k in made if k.startswith("classifier")))
+    with pytest.raises(DataError, match="not the weights of RankIQA"):
+        open_rankiqa(tmp_path / "w", trust=False)

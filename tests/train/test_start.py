@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from spikerig.dataset.errors import DataError
+from spikerig.dataset.rigid import exp_se3
 from spikerig.dataset.scene import Points
 from spikerig.train.config import configure
 from spikerig.train.gauge import Gauge, gauge_of
 from spikerig.train.start import SH0, fill, spacing, start_splats
-from spikerig.train.trajectory import exp_se3
 
 
 def surface(n: int, seed: int = 0) -> np.ndarray:

@@ -4,18 +4,9 @@ import numpy as np
 import pytest
 
 from spikerig.dataset.errors import DataError, UsageError
+from spikerig.dataset.rigid import between, compose, exp_se3, inverse, log_se3, rotation_vector
 from spikerig.dataset.scene import Frame, Pose, Trajectory, View
-from spikerig.train.trajectory import (
-    between,
-    compose,
-    exp_se3,
-    inverse,
-    log_se3,
-    phases,
-    pose_at,
-    rotation_vector,
-    sub_pose,
-)
+from spikerig.train.trajectory import phases, pose_at, sub_pose
 
 
 def motion(seed: int, angle: float) -> np.ndarray:

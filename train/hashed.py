@@ -1,0 +1,144 @@
+"""The fast field: hash grid and two small networks, samples put where a grid of densities says there is something."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from spikerig.train.config import FitConfig
+from spikerig.train.hashgrid import FEATURES, Layout, hash_encode, layout_of
+from spikerig.train.layers import chain, harmonics, new_layer
+from spikerig.train.rays import BOX, Rays, bounds
+from spikerig.train.volume import Traced, composite, inverse_cdf, stratified, weights_of
+
+if TYPE_CHECKING:
+    from spikerig.train.field import Step, Tensors
+
+GEOMETRY = 15  # numbers handed from the density's network to the colour's
+DENSEST = 11.0  # of the logarithm of density; e^11 is opaque within a thousandth of the gauge's unit
+EMPTY = 0.5  # density below which a cell is skipped: the whole box of it lets a third of the light through
+REFRESH, REVISIT, FADE = 16, 8, 0.8  # steps between refreshes, 1 / share of cells looked at, what stays of a cell's
+SPREAD = 0.25  # of the samples, evenly over what is not empty; the others where the grid's light goes
+
+
+def grid_layout(config: FitConfig) -> Layout:
+    """Of the config's hash grid."""
+    return layout_of(config.grid_levels, config.coarsest, config.finest, config.table_log2)
+
+
+def start_hashed(config: FitConfig) -> tuple[Tensors, Tensors]:
+    """Random parameters (features +-1e-4), and an occupancy grid in which nothing is empty."""
+    rng = np.random.default_rng((config.seed, 1))
+    layout = grid_layout(config)
+    table = rng.uniform(-1e-4, 1e-4, (layout.rows, FEATURES)).astype(np.float32)
+    params = {"table": torch.from_numpy(table)}
+    params |= new_layer("density/1", layout.width, config.width, rng)
+    params |= new_layer("density/2", config.width, 1 + GEOMETRY, rng, 1.0)
+    params |= new_layer("colour/1", GEOMETRY + (config.sh_degree + 1) ** 2, config.width, rng)
+    params |= new_layer("colour/2", config.width, 3, rng, 1.0)
+    return params, {"occupancy": torch.ones(config.occupancy, config.occupancy, config.occupancy)}
+
+
+class _Exp(torch.autograd.Function):
+    """e^x for x up to DENSEST and flat above, with a gradient that still leads back down from there."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        out = torch.exp(x.clamp(max=DENSEST))
+        ctx.save_for_backward(out)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> Any:
+        (out,) = ctx.saved_tensors
+        return grads[0] * out
+
+
+def density_of(params: Tensors, config: FitConfig, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Density [N] and geometry [N,15] at points [N,3] of the gauge."""
+    features = hash_encode(points * (0.5 / BOX) + 0.5, params["table"], grid_layout(config))
+    found = chain(params, ("density/1", "density/2"), features)
+    return _Exp.apply(found[:, 0]), found[:, 1:]  # type: ignore[return-value]
+
+
+def trace_hashed(
+    params: Tensors,
+    grids: Tensors,
+    config: FitConfig,
+    rays: Rays,
+    background: Tensor,
+    rng: np.random.Generator | None,
+) -> list[Traced]:
+    """What rays see: `coarse` cells of the occupancy grid are looked up, `fine` samples placed, the network asked.
+
+    Args:
+        params, grids: of the field.
+        config: coarse, fine: numbers of samples.
+        rays: B of the gauge.
+        background: [3].
+        rng: where in their pieces samples lie; None: in the middle.
+
+    Edges: a ray that meets only empty cells sees the background and has no gradient; empty gaps have no length.
+    """
+    with torch.no_grad():
+        distance, length = place(grids["occupancy"], config, rays, rng)
+        points = rays.origins[:, None] + rays.directions[:, None] * distance[..., None]
+    density, geometry = density_of(params, config, points.reshape(-1, 3))
+    seen = harmonics(rays.directions, config.sh_degree)[:, None].expand(-1, config.fine, -1).flatten(0, 1)
+    colour = torch.sigmoid(chain(params, ("colour/1", "colour/2"), torch.cat([geometry, seen], -1)))
+    shape = distance.shape
+    return [composite(density.reshape(shape), length, distance, colour.reshape(*shape, 3), background)]
+
+
+def place(occupancy: Tensor, config: FitConfig, rays: Rays, rng: np.random.Generator | None) -> tuple[Tensor, Tensor]:
+    """Distances [B,fine] of samples and the length of ray each stands for, empty stretches left out."""
+    near, far = bounds(rays)
+    shift = None if rng is None else torch.from_numpy(rng.random((len(rays), 1), np.float32)).to(near)
+    looked, edges = stratified(near, far, config.coarse, shift)
+    cells = cells_of(rays.origins[:, None] + rays.directions[:, None] * looked[..., None], len(occupancy))
+    density = occupancy.reshape(-1)[cells]
+    length = torch.where(density > EMPTY, edges[:, 1:] - edges[:, :-1], 0.0)
+    weights, _ = weights_of(density, length)
+    share = (1 - SPREAD) * weights / weights.sum(-1, keepdim=True).clamp(min=1e-9)
+    share = share + SPREAD * length / length.sum(-1, keepdim=True).clamp(min=1e-9)
+    cuts = torch.arange(config.fine + 1, dtype=near.dtype, device=near.device) / config.fine
+    inside = 0.5 if rng is None else torch.from_numpy(rng.random((len(rays), config.fine), np.float32)).to(near)
+    middle = (torch.arange(config.fine, dtype=near.dtype, device=near.device) + inside) / config.fine
+    both = inverse_cdf(edges, share, torch.cat([cuts.expand(len(rays), -1), middle.expand(len(rays), -1)], -1))
+    found, distance = both[:, : config.fine + 1], both[:, config.fine + 1 :]
+    return distance, torch.diff(_occupied_before(found, edges, length)).clamp(min=0)
+
+
+def _occupied_before(distance: Tensor, edges: Tensor, length: Tensor) -> Tensor:
+    """How much of a ray before each distance [B,S] is not empty; edges [B,N+1] equally spaced, length [B,N]."""
+    count = length.shape[-1]
+    near, step = edges[:, :1], (edges[:, -1:] - edges[:, :1]) / count
+    at = ((distance - near) / step.clamp(min=1e-12)).clamp(0, count)
+    piece = at.long().clamp(max=count - 1)
+    before = torch.cumsum(length, -1) - length
+    return before.gather(-1, piece) + (at - piece) * length.gather(-1, piece)
+
+
+def cells_of(points: Tensor, side: int) -> Tensor:
+    """Numbers of the occupancy cells of points [...,3] of the gauge; beyond the box, those at its border."""
+    at = ((points * (0.5 / BOX) + 0.5) * side).long().clamp(0, side - 1)
+    return (at[..., 2] * side + at[..., 1]) * side + at[..., 0]
+
+
+@torch.no_grad()
+def refresh(params: Tensors, grids: Tensors, config: FitConfig, step: Step) -> None:
+    """Look at a share of the cells: each fades, and holds at least the density at a random place inside."""
+    if step.number % REFRESH:
+        return
+    side = config.occupancy
+    total = side**3
+    # every REVISIT-th cell, another comb each time: all are visited in turn, at no cost of drawing
+    cells = np.arange((step.number // REFRESH * 5) % REVISIT, total, REVISIT)
+    corner = np.stack([cells % side, cells // side % side, cells // side**2], -1)
+    points = (corner + step.rng.random((len(cells), 3))) * (2 * BOX / side) - BOX
+    density, _ = density_of(params, config, torch.from_numpy(points.astype(np.float32)))
+    flat, where = grids["occupancy"].reshape(-1), torch.from_numpy(cells)
+    flat[where] = torch.maximum(FADE * flat[where], density)
