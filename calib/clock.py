@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 
 import numpy as np
@@ -12,12 +12,13 @@ from spikerig.calib.clock_hull import ASSUMED_NS, hull_floor
 from spikerig.calib.clock_maps import ClockFit, Clocks, as_fit, compose, invert, joined, shifted
 from spikerig.calib.clock_probe import Gated, gate, reweighed
 from spikerig.calib.clock_resets import once, parts
-from spikerig.calib.clock_sight import ALLOWED_NS, named, sight_pairs
+from spikerig.calib.clock_sight import ALLOWED_NS, around, named, pooled, sight_pairs
 from spikerig.calib.clock_track import Pairs, Track, Wander, track
 from spikerig.dataset.clocktime import ClockModel
 from spikerig.dataset.errors import DataError
 from spikerig.dataset.marks import Mark, Probe, Reset, Sight
 
+LEAST_PPM = 2.0  # a camera's clips differ by as much: it warms
 LEAST_NS = {"two-way": 100_000.0, "one-way": 1_000_000.0, "sights": 400_000.0}  # smaller steps are not told apart
 
 
@@ -88,7 +89,7 @@ def fit_clock(marks: Sequence[Mark], clock: str, options: Options | None = None)
         return [piece for key, group in keyed for piece in _two_way(key[0], group, options)]
     sights = _grouped([m for m in marks if isinstance(m, Sight) and m.clock == clock], lambda s: s.epoch)
     stamps = _grouped([m for m in marks if isinstance(m, Probe) and m.clock == clock], lambda p: p.epoch)
-    told = [piece for epoch, group in sights for piece in _sights(clock, epoch, group, options)]
+    told = _sights(clock, sights, options)
     have = {piece.epoch for piece in told}
     return told + [p for epoch, group in stamps if epoch not in have for p in _one_way(clock, epoch, group, options)]
 
@@ -104,10 +105,29 @@ def _two_way(epoch: int, probes: Sequence[Probe], options: Options) -> list[Piec
     return _pieces("host", epoch, "two-way", "box", gated.pairs, options, least, bias, True)
 
 
-def _sights(clock: str, epoch: int, sights: Sequence[Sight], options: Options) -> list[Piece]:
-    return _pieces(
-        clock, epoch, "sights", "box", sight_pairs(sights), options, LEAST_NS["sights"], ALLOWED_NS[clock], False
+def _sights(clock: str, groups: list[tuple[int, list[Sight]]], options: Options) -> list[Piece]:
+    lags = any(s.predicted for _, group in groups for s in group)
+    pairs = [(epoch, sight_pairs(group, lags)) for epoch, group in groups]
+    rest = (LEAST_NS["sights"], ALLOWED_NS[clock], False)
+    if clock == "rgb" and lags and len(pairs) > 1:
+        options = replace(options, wander=replace(options.wander, skew_ppm=0.0))
+    told = [p for epoch, own in pairs for p in _pieces(clock, epoch, "sights", "box", own, options, *rest)]
+    if options.wander.skew_ppm is None:
+        return told
+    # A clip is short, and few of its frames are coded by themselves: all clips of the camera together tell how late
+    # the others are, and how fast its clock runs.
+    tracks = [p.track for p in told]
+    mean, sd = pooled([t.constants for t in tracks], [t.constants_sd for t in tracks], pairs[0][1].prior)
+    wander = options.wander
+    (ppm,), (within,) = pooled(
+        [np.array([t.skew_ppm]) for t in tracks], [np.array([t.skew_sd_ppm]) for t in tracks], np.array([wander.ppm])
     )
+    options = replace(options, wander=replace(wander, skew_ppm=float(ppm), ppm=float(max(within, LEAST_PPM))))
+    told = [
+        p for epoch, own in pairs
+        for p in _pieces(clock, epoch, "sights", "box", around(own, mean, sd), options, *rest)
+    ]  # fmt: skip
+    return [replace(p, track=replace(p.track, constants=p.track.constants + mean)) for p in told]
 
 
 def _one_way(clock: str, epoch: int, probes: Sequence[Probe], options: Options) -> list[Piece]:

@@ -27,6 +27,7 @@ class Wander:
             is taken unless the marks speak clearly for another.
         ppm: standard deviation of the frequency before anything is known.
         drift: of the drift before anything is known, 1/s; 1 ppm/min is 1.7e-8.
+        skew_ppm: the frequency's middle before anything is known; None: that of the marks' own middle line.
         cell_s: comparisons within this time are joined: the wander inside it is far below any of them.
     """
 
@@ -35,6 +36,7 @@ class Wander:
     ppm: float = 100.0
     drift: float = 3e-8
     cell_s: float = 0.5
+    skew_ppm: float | None = None
 
     @property
     def ramp(self) -> float:
@@ -150,7 +152,7 @@ def track(pairs: Pairs, wander: Wander | None = None, rounds: int = 8) -> Track:
     origin = (int(pairs.x_ns[np.argmin(pairs.x_ns)]), int(pairs.y_ns[np.argmin(pairs.x_ns)]))
     at_s = (pairs.x_ns - origin[0]).astype(np.float64) / NS
     ahead = ((pairs.y_ns - origin[1]) - (pairs.x_ns - origin[0])).astype(np.float64)
-    line, near = middle_line(at_s, ahead, pairs.sd_ns)
+    line, near = middle_line(at_s, ahead, pairs.sd_ns, wander.skew_ppm)
     rest = ahead - (line[0] + line[1] * at_s)
     grid = _Grid(at_s, wander, pairs.extra)
     found = _settled(grid, rest, pairs, near, rounds)
@@ -197,7 +199,9 @@ def _check(pairs: Pairs) -> None:
         raise UsageError("pairs are x[N], y[N], positive sd[N] and extra[N,E] with prior[E], all finite")
 
 
-def middle_line(at_s: Floats, ahead: Floats, sd: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def middle_line(
+    at_s: Floats, ahead: Floats, sd: Floats, skew_ppm: float | None = None
+) -> tuple[Floats, NDArray[np.bool_]]:
     """A line through the middle of the marks (medians of bins, median of slopes), and which lie anywhere near it."""
     order = np.argsort(at_s, kind="stable")
     bins = np.array_split(order, min(len(order), 60))
@@ -206,6 +210,7 @@ def middle_line(at_s: Floats, ahead: Floats, sd: Floats) -> tuple[Floats, NDArra
     apart = t[j] - t[i]
     far = apart > 0.1 * max(float(np.ptp(t)), 1e-9)
     slope = float(np.median((y[j] - y[i])[far] / apart[far])) if far.any() else 0.0
+    slope = slope if skew_ppm is None else skew_ppm * 1e3
     start = float(np.median(y - slope * t))
     off = np.abs(ahead - start - slope * at_s)
     return np.array([start, slope]), off <= max(30 * float(np.median(off)), 1e6, 10 * float(np.median(sd)))

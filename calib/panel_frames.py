@@ -21,27 +21,30 @@ FLOOR = 0.002  # deviation of a share below which nothing is believed: quantisat
 
 
 class Look(NamedTuple):
-    """A frame: when row 0 began to be exposed (camera time), for how long, and its linear light [H,W]."""
+    """A frame: when row 0 began to be exposed (camera time), for how long, its linear light [H,W], and whether the
+    video codes it as changes to another."""
 
     start_ns: int
     exposure_ns: int
     light: NDArray
+    predicted: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Seen:
     """What of F frames is kept: int64[F] times, float64[F,L] light of the spots and its deviation, float64[L] the
-    spots' middle rows (the first row of the picture is 0)."""
+    spots' middle rows (the first row of the picture is 0), bool[F] whether it was predicted."""
 
     start_ns: NDArray[np.int64]
     exposure_ns: NDArray[np.int64]
     light: Floats
     noise: Floats
     row: Floats
+    predicted: NDArray[np.bool_]
 
 
 def read_frames(
-    looks: Iterable[tuple[int, int, NDArray]],
+    looks: Iterable[tuple[int, int, NDArray] | Look],
     panel: Panel,
     spots: Sequence[Spot],
     row_ns: float,
@@ -83,14 +86,15 @@ def read_frames(
     return sorted(told, key=lambda s: s.device_ns)
 
 
-def _blocks(looks: Iterable[tuple[int, int, NDArray]], spots: Sequence[Spot], size: int) -> Iterator[Seen]:
-    rows: list[tuple[int, int, Floats, Floats]] = []
+def _blocks(looks: Iterable[tuple[int, int, NDArray] | Look], spots: Sequence[Spot], size: int) -> Iterator[Seen]:
+    rows: list[tuple[int, int, Floats, Floats, bool]] = []
     disks: list[tuple[slice, slice, NDArray[np.bool_]]] = []
-    for start, exposure, light in looks:
+    for told in looks:
+        start, exposure, light, predicted = told if isinstance(told, Look) else Look(*told)
         disks = disks or [s.disk(*light.shape[:2]) for s in spots]
         values = [np.asarray(light[r, c][inside], np.float64) for r, c, inside in disks]
         noise = np.array([v.std() / np.sqrt(len(v)) for v in values])
-        rows.append((int(start), int(exposure), np.array([v.mean() for v in values]), noise))
+        rows.append((int(start), int(exposure), np.array([v.mean() for v in values]), noise, bool(predicted)))
         if len(rows) == size:
             yield _seen(rows, disks)
             rows.clear()
@@ -98,10 +102,15 @@ def _blocks(looks: Iterable[tuple[int, int, NDArray]], spots: Sequence[Spot], si
         yield _seen(rows, disks)
 
 
-def _seen(rows: list[tuple[int, int, Floats, Floats]], disks: Sequence[tuple[slice, slice, NDArray[np.bool_]]]) -> Seen:
-    start, exposure, light, noise = zip(*rows, strict=True)
+def _seen(
+    rows: list[tuple[int, int, Floats, Floats, bool]], disks: Sequence[tuple[slice, slice, NDArray[np.bool_]]]
+) -> Seen:
+    start, exposure, light, noise, predicted = zip(*rows, strict=True)
     middle = np.array([r.start + np.nonzero(inside)[0].mean() for r, _, inside in disks])
-    return Seen(np.array(start, np.int64), np.array(exposure, np.int64), np.stack(light), np.stack(noise), middle)
+    return Seen(
+        np.array(start, np.int64), np.array(exposure, np.int64), np.stack(light), np.stack(noise), middle,
+        np.array(predicted, bool),
+    )  # fmt: skip
 
 
 def _banks(spots: Sequence[Spot], panel: Panel) -> list[list[int]]:
@@ -154,7 +163,8 @@ def _bank(
             length = float(seen.exposure_ns[frame])
             told.append(
                 Sight("rgb", epoch, at + round(rows[k] * row_ns + into * length), panel_ns,
-                      float(sd[frame, k]) * length, rising, spots[k].led, float(rows[k]))
+                      float(sd[frame, k]) * length, rising, spots[k].led, float(rows[k]),
+                      bool(seen.predicted[frame]))
             )  # fmt: skip
     return told
 

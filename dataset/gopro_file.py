@@ -42,6 +42,7 @@ class GoProClip:
         iso: float64[N], ISOE; None without.
         skipped: int64[N], sensor frames left out (positive) or shown twice (negative) just before each frame, MSKP.
         srot_ms: read-out time of the sensor, first row to last, SROT; None without.
+        key: bool[N], frames coded by themselves; the others are predicted from them, and lag (docs/clock.md).
         streams: by key, e.g. "ACCL", "GYRO", "CORI".
         remarks: what was odd and how it was taken.
     """
@@ -62,11 +63,13 @@ class GoProClip:
     iso: NDArray[np.float64] | None
     skipped: NDArray[np.int64]
     srot_ms: float | None
+    key: NDArray[np.bool_]
     streams: Mapping[str, Samples]
     remarks: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        for name, kind in (("start_ns", np.int64), ("exposure_ns", np.int64), ("iso", float), ("skipped", np.int64)):
+        for name, kind in (("start_ns", np.int64), ("exposure_ns", np.int64), ("iso", float), ("skipped", np.int64),
+                           ("key", bool)):  # fmt: skip
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, frozen_array(getattr(self, name), kind))
 
@@ -159,6 +162,7 @@ def open_gopro(path: str | Path | Sequence[str | Path]) -> GoProClip:
         iso=iso,
         skipped=np.zeros(len(start_ns), np.int64) if skipped is None else skipped.astype(np.int64),
         srot_ms=_srot(first.path, settings),
+        key=np.concatenate([p.video.key[np.argsort(p.video.pts, kind="stable")] for p in parts]),
         streams=_joined(parts),
         remarks=tuple(remarks),
     )

@@ -46,6 +46,7 @@ class Sight:
         rising: the LED went on; response errors of a camera have opposite signs for on and off.
         led: number of the LED on the panel.
         row: sensor row of the LED; NaN-free: 0.0 for a global shutter.
+        predicted: the video's frame was coded as changes to another: its encoder may leave out part of the edge.
     """
 
     clock: str
@@ -56,6 +57,7 @@ class Sight:
     rising: bool
     led: int
     row: float = 0.0
+    predicted: bool = False
 
 
 @dataclass(frozen=True, slots=True)

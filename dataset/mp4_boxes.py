@@ -41,6 +41,7 @@ class Track:
         sizes, offsets: int64[N], bytes of each sample and where they lie in the file, in decoding order.
         dts, pts: int64[N], when a sample is decoded and shown.
         durations: int64[N] of each sample.
+        key: bool[N], coded by itself (stss); all where the file does not tell.
     """
 
     handler: str
@@ -53,6 +54,7 @@ class Track:
     dts: NDArray[np.int64]
     pts: NDArray[np.int64]
     durations: NDArray[np.int64]
+    key: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,7 +224,31 @@ def _track(path: Path, size: int, raw: dict[str, bytes]) -> Track:
         raise damaged(path, f"a {form!r} sample lies beyond the end of the file")
     if handler != "vide" and int(sizes.sum()) > size:
         raise damaged(path, f"the samples of {form!r} overlap")
-    return Track(handler, form, timescale, width, height, sizes, offsets, dts, dts + shift, durations)
+    return Track(
+        handler,
+        form,
+        timescale,
+        width,
+        height,
+        sizes,
+        offsets,
+        dts,
+        dts + shift,
+        durations,
+        _keys(path, raw, len(sizes)),
+    )
+
+
+def _keys(path: Path, raw: dict[str, bytes], count: int) -> NDArray[np.bool_]:
+    """Which samples need no other; without a table every one."""
+    if "stss" not in raw:
+        return np.ones(count, bool)
+    number = _table(path, raw["stss"], "stss", 8, ">u4", 1)[:, 0]
+    if len(number) and (number.min() < 1 or number.max() > count):
+        raise damaged(path, f"stss names samples {number.min()} to {number.max()}, there are {count}")
+    key = np.zeros(count, bool)
+    key[number - 1] = True
+    return key
 
 
 def _table(path: Path, data: bytes, what: str, head: int, dtype: str, columns: int) -> NDArray[np.int64]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.calib.clock_maps import Clocks
-from spikerig.calib.panel_frames import read_frames
+from spikerig.calib.panel_frames import Look, read_frames
 from spikerig.calib.panel_read import Spot, read_spikes
 from spikerig.dataset.clocktime import NS
 from spikerig.dataset.errors import DataError, RefusedError, UsageError
@@ -129,7 +129,7 @@ def _rgb_sights(
     )  # fmt: skip
 
 
-def _looks(clip: GoProClip) -> Iterator[tuple[int, int, NDArray[np.floating]]]:
-    for _, frame in read_pictures(clip, range(clip.frames)):
+def _looks(clip: GoProClip) -> Iterator[Look]:
+    for number, frame in read_pictures(clip, range(clip.frames)):
         light = np.asarray(linear_from_srgb(np.asarray(frame.pixels, np.float32) / frame.full), np.float32) @ GRAY
-        yield frame.start_ns, frame.exposure_ns, light
+        yield Look(frame.start_ns, frame.exposure_ns, light, not clip.key[number])

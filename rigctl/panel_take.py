@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.calib.clock import Piece, fit_clock
-from spikerig.calib.panel_frames import read_frames
+from spikerig.calib.panel_frames import Look, read_frames
 from spikerig.calib.panel_read import Spot, read_spikes
 from spikerig.dataset.clocktime import NS
 from spikerig.dataset.errors import DataError, RigError, UsageError
@@ -180,9 +180,12 @@ def _of_clips(take: RawTake, views: list[TakenView], view: InView, near: _Near) 
                 yield f"{taken.name}, clip: it does not tell exposures or read-out"
                 continue
             ahead = near.of_host(int(taken.clip["start_ns"][-1])) - int(clip.start_ns[0])
-            looks = ((f.start_ns, f.exposure_ns, _Linear(f.pixels)) for _, f in read_pictures(clip, range(clip.frames)))
+            looks = (
+                Look(f.start_ns, f.exposure_ns, _Linear(f.pixels), not clip.key[k])  # type: ignore[arg-type]
+                for k, f in read_pictures(clip, range(clip.frames))
+            )
             number = clip_number(taken.clips[0])
-            yield read_frames(looks, view.panel, view.rgb, clip.row_ns, epoch=number, ahead_ns=ahead)  # type: ignore[arg-type]
+            yield read_frames(looks, view.panel, view.rgb, clip.row_ns, epoch=number, ahead_ns=ahead)
         except RigError as error:
             yield f"{taken.name}, clip: {error.what}"
 

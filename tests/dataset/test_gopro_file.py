@@ -373,3 +373,20 @@ def test_nearest_is_the_brute_force():
     near = nearest(at, wanted)
     assert np.array_equal(np.abs(at[near] - wanted), np.abs(at[:, None] - wanted).min(0))
     assert nearest(np.array([5]), wanted).tolist() == [0] * 200
+
+
+def test_frames_coded_by_themselves_are_told_through_chapters(tmp_path):
+    paths, _ = clip(tmp_path, 100, chapter_bytes=300)
+    assert len(paths) > 1
+    key = open_gopro(paths).key
+    assert np.flatnonzero(key).tolist() == list(range(0, 100, 15))
+
+
+@pytest.mark.parametrize("number", [0, 101, 1 << 31])
+def test_a_key_frame_that_is_not_there_is_refused(tmp_path, number):
+    (path,), _ = clip(tmp_path, 100)
+    raw = path.read_bytes()
+    at = raw.rfind(b"stss") + 12
+    path.write_bytes(raw[:at] + number.to_bytes(4, "big") + raw[at + 4 :])
+    with pytest.raises(DataError, match="damaged"):
+        open_gopro(path)

@@ -13,6 +13,7 @@ from spikerig.calib.gauge import Similarity, similarity
 from spikerig.dataset.cli import run
 from spikerig.dataset.errors import DataError, NumericsError
 from spikerig.dataset.images import read_image
+from spikerig.dataset.rigid import compose, exp_se3
 from spikerig.dataset.scene import Pose
 from spikerig.dataset.store import open_scene, write_scene
 from spikerig.train import metrics
@@ -24,7 +25,6 @@ from spikerig.train.realign import realign, twist_gradient
 from spikerig.train.record import open_run
 from spikerig.train.run import run_fit
 from spikerig.train.score import grade, novel_views
-from spikerig.train.trajectory import compose, exp_se3
 
 TURN = exp_se3(np.array([0.3, -1.1, 0.4, 0, 0, 0]))[:, :3]
 ELSEWHERE = Similarity(2.5, TURN, np.array([1.0, -4.0, 0.5]))
