@@ -15,6 +15,7 @@ from spikerig.dataset.rawtake import RawTake, WireBytes, read_lines
 
 LOOK_TICKS, EVERY_TICKS = 32, 128  # of a look, and between two
 SEAM_TICKS = 256  # of a stretch whose edges are looked at
+LEAST_GAIN = 8.0  # nats by which the edges must have moved
 MOST_STRETCHES = 16  # on each side
 SURE = 0.999
 
@@ -46,9 +47,9 @@ def find_slips(wire: WireBytes, spans: Spans) -> list[Missing]:
 
     Edges:
         A picture that moves by a row looks like a loss of a row's bytes. So without tags a shift is believed only
-        where it comes at once, within some 3 ms, and is no whole number of rows (a byte more or less): such a loss is
-        not told here. Whole ticks that are lost move nothing: only time can tell them. Losses between viewpoints are
-        not looked for: framing that differs between viewpoints is refused by `Framing`.
+        where it comes at once, within some 3 ms; and one of whole rows (a byte more or less) only where the picture's
+        edges moved, too. Whole ticks that are lost move nothing: only time can tell them. Losses between viewpoints
+        are not looked for: framing that differs between viewpoints is refused by `Framing`.
 
     Cost:
         A look of 32 ticks every 128: a quarter of the bytes is looked at, about 15 ms a look at 400x250.
@@ -111,13 +112,23 @@ def _settled(wire: WireBytes, slip: Missing, spans: Spans, shift: int) -> Missin
     if profile.framing == "m1k40":
         return slip
     if not 1 < shift % row < row - 1:
-        return None
+        return slip if _edges_moved(wire, slip, spans, shift) else None
     mine = [(a, b) for e, a, b in sorted(set(spans)) if e == slip.epoch]
     first = _edges(wire, slip.epoch, [(a, min(b, slip.after)) for a, b in mine][::-1])
     second = _edges(wire, slip.epoch, [(max(a, slip.before), b) for a, b in mine])
     likely = {by: float(np.max(first + np.roll(second, -by))) for by in (shift - row, shift, shift + row)}
     by = max(likely, key=likely.__getitem__)
     return replace(slip, lost=(size - by) % size)
+
+
+def _edges_moved(wire: WireBytes, slip: Missing, spans: Spans, shift: int) -> bool:
+    """Whether the picture's edges surely went with a shift, in the nearest stretches on either side."""
+    size = wire.take.profile.tick_bytes
+    a, b = next((a, b) for e, a, b in spans if e == slip.epoch and a <= slip.after and slip.before <= b)
+    room = (SEAM_TICKS + 1) * size
+    first = _edges(wire, slip.epoch, [(max(a, slip.after - room), slip.after)])
+    second = _edges(wire, slip.epoch, [(slip.before, min(b, slip.before + room))])
+    return float(np.max(first + np.roll(second, -shift)) - np.max(first + second)) > LEAST_GAIN
 
 
 def _edges(wire: WireBytes, epoch: int, spans: Sequence[tuple[int, int]]) -> NDArray[np.float64]:

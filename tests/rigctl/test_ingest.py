@@ -3,10 +3,12 @@
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from emulated_takes import plan_of, take
+from framing_scenes import wire_bytes
 
 from spikerig.calib.panel_read import Spot
 from spikerig.dataset.cli import run
@@ -17,9 +19,10 @@ from spikerig.dataset.segments import Chunk, scan
 from spikerig.dataset.store import open_scene, verify_scene
 from spikerig.rigctl.ingest import IngestConfig, ingest
 from spikerig.rigctl.ingest_sights import panel_pairs, sights
-from spikerig.rigctl.ingest_slips import MendedBytes
+from spikerig.rigctl.ingest_slips import MendedBytes, find_slips
 from spikerig.rigctl.ingest_times import Framing, Times, clip_number, read_truth
 from spikerig.rigctl.ingest_truth import TrueWorld
+from spikerig.rigctl.profiles import PROFILES
 
 
 @pytest.fixture(scope="module")
@@ -270,3 +273,21 @@ def test_frames_of_a_long_shutter_are_timed_as_well_as_is_claimed(tmp_path: Path
     wrong = np.abs(np.concatenate(off))
     assert np.percentile(wrong, 99) <= 100_000
     assert (wrong <= np.concatenate(claimed)).mean() >= 0.95
+
+
+@pytest.mark.parametrize(
+    ("kind", "lost", "sure"), [("texture", 100, True), ("object", 100, False), ("texture", 0, False)]
+)
+def test_a_loss_of_whole_rows_is_told_where_the_picture_has_edges(kind: str, lost: int, sure: bool) -> None:
+    profile = PROFILES["vidar-400x250-20k"]  # 100 bytes are two rows of it
+    data = np.tile(wire_bytes(profile, kind, 256), 5)
+    cut = 600 * profile.tick_bytes + 300
+    came = np.concatenate([data[:cut], data[cut + lost :]])
+
+    def read(epoch: int, start: int, stop: int) -> tuple[np.ndarray, list[tuple[int, int]]]:
+        return came[start:stop], [] if stop <= len(came) else [(len(came), stop)]
+
+    wire = SimpleNamespace(take=SimpleNamespace(profile=profile), read=read)
+    found = find_slips(wire, [(0, 0, len(came))])  # type: ignore[arg-type]
+    assert [s.lost for s in found] == [lost] * sure
+    assert all(s.after <= cut <= s.before for s in found)
