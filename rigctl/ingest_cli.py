@@ -27,7 +27,10 @@ def ingest(
     force: Annotated[bool, typer.Option("--force", help="Replace an existing scene.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
 ) -> None:
-    """Make a scene of a take: frames cut by the clock map, each with the spikes around it. Exit 1: views left out."""
+    """Make a scene of a take: frames cut by the clock map, each with the spikes around it.
+
+    Exit codes: 1 where views are left out or ticks are lost; the scene is made all the same.
+    """
     from spikerig.rigctl.ingest import IngestConfig
     from spikerig.rigctl.ingest import ingest as run
 
@@ -46,5 +49,5 @@ def ingest(
         f"{out}: {told['views']} views ({len(told['test'])} held out), {told['lost_ticks']} ticks lost, frames timed "
         f"by {' and '.join(told['rgb_times'])}, clocks good to {2 * told['sigma_us']:.0f} us"
     )
-    if told["left_out"]:
+    if told["left_out"] or told["lost_ticks"]:
         raise typer.Exit(1)

@@ -127,6 +127,7 @@ def test_a_damaged_chunk_becomes_lost_ticks(folder: Path, tmp_path: Path) -> Non
     data = bytearray(hit.path.read_bytes())
     data[hit.offset + 5] ^= 1
     hit.path.write_bytes(data)
+    assert run(["data", "ingest", str(folder), "-o", str(tmp_path / "told.h5")]) == 1
     told = ingest(folder, tmp_path / "s.h5")
     assert told["lost_ticks"] > 100
     with open_scene(tmp_path / "s.h5") as file:
