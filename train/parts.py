@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
@@ -18,7 +18,6 @@ from spikerig.train.field import Step, Tensors
 if TYPE_CHECKING:
     from spikerig.dataset.scene import View
     from spikerig.dataset.store import SceneFile
-    from spikerig.train.fit import State, Task
     from spikerig.train.targets import TrainView
 
 
@@ -31,21 +30,21 @@ class Part:
         instants: config -> fractions of the exposure that are rendered beside those of colour and textures.
         read: (scene, view, config) -> pictures [H,W,...] by name, kept as TrainView.beside (of a batch of pixels, the
             values there).
-        start: task -> parameters by their short names; identity (a part at its start changes nothing).
+        start: fit.Task -> parameters by their short names; identity (a part at its start changes nothing).
         rate: (short name, config, fraction of the run done) -> learning rate of a step.
         pose: (params, view, phase, pose, config) -> pose of that instant, [3,4] or [B,3,4].
         expose: (params, view, picture, config) -> the exposed picture as the camera would hand it out.
-        loss: (state, task, view, pictures by phase, step) -> terms that are added to the loss.
+        loss: (fit.State, fit.Task, view, pictures by phase, step) -> terms that are added to the loss.
     """
 
     name: str
     instants: Callable[[FitConfig], tuple[float, ...]] | None = None
     read: Callable[[SceneFile, View, FitConfig], dict[str, Tensor]] | None = None
-    start: Callable[[Task], Tensors] | None = None
+    start: Callable[[Any], Tensors] | None = None
     rate: Callable[[str, FitConfig, float], float] | None = None
     pose: Callable[[Tensors, TrainView, float, Tensor, FitConfig], Tensor] | None = None
     expose: Callable[[Tensors, TrainView, Tensor, FitConfig], Tensor] | None = None
-    loss: Callable[[State, Task, TrainView, dict[float, Tensor], Step], list[Tensor]] | None = None
+    loss: Callable[[Any, Any, TrainView, dict[float, Tensor], Step], list[Tensor]] | None = None
 
 
 def parts_of(config: FitConfig) -> tuple[Part, ...]:
@@ -61,7 +60,7 @@ def part_of(config: FitConfig, parameter: str) -> tuple[Part, str] | None:
     return next((part, short) for part in parts_of(config) if part.name == name)
 
 
-def start_parts(task: Task) -> Tensors:
+def start_parts(task: Any) -> Tensors:
     """The parameters of all parts at step 0."""
     return {
         f"{part.name}:{short}": tensor
