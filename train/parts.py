@@ -49,7 +49,12 @@ class Part:
 
 def parts_of(config: FitConfig) -> tuple[Part, ...]:
     """The parts that a config asks for, in the order in which they act."""
-    return ()
+    found: list[Part] = []
+    if config.trajectory != "given":
+        from spikerig.train.path import PART as PATH
+
+        found.append(PATH)
+    return tuple(found)
 
 
 def part_of(config: FitConfig, parameter: str) -> tuple[Part, str] | None:
