@@ -78,7 +78,8 @@ def descend(params: Tensors, moments: dict[str, tuple[Tensor, Tensor]], config: 
     """One step of the views that were looked at: Adam with two lengths a view (moving its path, bending it).
 
     A view is looked at once an epoch; plain Adam would go on moving it in between. One length for many numbers lets the
-    directions go first that the pictures tell apart; a length each would shake the others at the same rate. The rate is lr_poses, grown over the first WARM of the run, falling to lr_poses_end times that.
+    directions go first that the pictures tell apart; a length each would shake the others at the same rate. The rate is
+    lr_poses, grown over the first WARM of the run, falling to lr_poses_end times that.
     """
     knots, looks, freedom = params["knots"], params["looks"], params["freedom"]
     if knots.grad is None:
@@ -120,7 +121,7 @@ def start(task: Task) -> Tensors:
     where = np.linspace(-0.5, 0.5, count)[:, None]
     for number, view in enumerate(targets.views):
         poses = [instant.pose for instant in view.instants.values()]
-        if all(torch.equal(each, poses[0]) for each in poses):
+        if len(poses) > 1 and all(torch.equal(each, poses[0]) for each in poses):
             angle = np.random.default_rng((config.seed, 7, number)).uniform(0, 2 * np.pi)
             turn = START_PX / float(task.camera.K[0, 0])
             knots[number, :, :2] = where * turn * [np.cos(angle), np.sin(angle)]
