@@ -19,7 +19,7 @@ def fit(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the run.")],
     method: Annotated[
         str,
-        typer.Option(help="Loss and camera model: plain, average, spikenerf, spikenerf-5x, spike-ratio, "
+        typer.Option(help="Loss and camera model: plain, average, bad, spikenerf, spikenerf-5x, spike-ratio, "
                      "spike-hybrid, oracle."),
     ] = "plain",
     field: Annotated[str, typer.Option(help="The model: splat, nerf (the paper's), nerf-fast (hash grid).")] = "splat",
