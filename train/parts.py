@@ -54,7 +54,7 @@ class Part:
 
 def parts_of(config: FitConfig) -> tuple[Part, ...]:
     """The parts that a config asks for, in the order in which they act."""
-    found: list[Part] = []
+    found: list[Any] = []  # of Part, which a type checker sees under two names here
     if config.trajectory != "given":
         from spikerig.train.path import PART as PATH
 
