@@ -237,10 +237,13 @@ def test_bad_finds_the_path_of_a_blur_from_its_mid_pose(tiny, still, tmp_path):
     rays = configure("bad", "draft", field="nerf-fast")
     assert rays.colour_loss == "l2"
     assert rays.poses_per_view == 10
-    run_fit(tiny, configure("bad", "draft", splats=800, steps=400, lr_poses=1e-2), tmp_path / "c", eval_every=0)
-    run_fit(tiny, configure("plain", "draft", splats=800, steps=400), tmp_path / "plain", eval_every=0)
-    psnr = {n: json.loads((tmp_path / n / "history.json").read_text())[-1]["psnr"] for n in ("c", "plain")}
-    assert psnr["c"] > psnr["plain"] + 0.5
+    small = {"splats": 800, "steps": 200}
+    few = configure("bad", "draft", poses_per_view=5, lr_poses=1e-2, **small)
+    psnr = {
+        name: run_fit(tiny, config, tmp_path / name, eval_every=0)["psnr"]
+        for name, config in (("c", few), ("plain", configure("plain", "draft", **small)))
+    }
+    assert psnr["c"] > psnr["plain"]
     told = json.loads((tmp_path / "c/paths.json").read_text())["cam_from_world"]
     likeness = []
     with open_scene(tiny) as scene:
@@ -250,7 +253,7 @@ def test_bad_finds_the_path_of_a_blur_from_its_mid_pose(tiny, still, tmp_path):
             true = [pose_at(view.trajectory, view.instant_ns(phase)) for phase in (0.0, 1.0)]
             found, wanted = (log_se3(compose(b, inverse(a)))[:2] for a, b in (ends, true))
             likeness.append(abs(found @ wanted) / np.linalg.norm(found) / np.linalg.norm(wanted))  # forth or back
-    assert np.median(likeness) > 0.8
+    assert np.median(likeness) > 0.8, likeness
 
 
 @pytest.mark.parametrize(
