@@ -74,7 +74,7 @@ def read_frames(
     told: list[Sight] = []
     frames = 0
     banks = _banks(spots, panel)
-    for seen in _blocks(looks, spots, block):
+    for seen in blocks(looks, spots, block):
         frames += len(seen.start_ns)
         for which in banks:
             told += _bank(seen, panel, [spots[k] for k in which], which, row_ns, epoch, ahead_ns)
@@ -86,7 +86,8 @@ def read_frames(
     return sorted(told, key=lambda s: s.device_ns)
 
 
-def _blocks(looks: Iterable[tuple[int, int, NDArray] | Look], spots: Sequence[Spot], size: int) -> Iterator[Seen]:
+def blocks(looks: Iterable[tuple[int, int, NDArray] | Look], spots: Sequence[Spot], size: int) -> Iterator[Seen]:
+    """What is kept of frames, `size` of them at a time; see `read_frames` for the arguments."""
     rows: list[tuple[int, int, Floats, Floats, bool]] = []
     disks: list[tuple[slice, slice, NDArray[np.bool_]]] = []
     for told in looks:
@@ -141,7 +142,7 @@ def _bank(
             expected=f"at most {word_ns / 1e3:.0f} us",
             next="a shorter shutter, or a panel whose slow bits start later",
         )  # fmt: skip
-    found = _shares(seen.light[:, which])
+    found = shares(seen.light[:, which])
     if found is None:
         return []
     share, contrast = found
@@ -176,7 +177,7 @@ def _single(half: NDArray[np.bool_], bit: NDArray[np.int64]) -> NDArray[np.bool_
     return low == high
 
 
-def _shares(light: Floats) -> tuple[Floats, Floats] | None:
+def shares(light: Floats) -> tuple[Floats, Floats] | None:
     """Light as a share between each LED's off and on; levels of LEDs that never toggle are those of the others."""
     low, high = np.percentile(light, (2, 98), axis=0)
     steady = light[(np.abs(light - low) < 0.05 * (high - low)) | (np.abs(light - high) < 0.05 * (high - low))]

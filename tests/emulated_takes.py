@@ -33,7 +33,7 @@ def rig_of(plan: TakePlan, folder: Path, after_ns: int = 0, **more: Any) -> Rig:
     """The emulated rig, with more in its tables."""
     table: dict[str, Any] = {k: dict(v) if isinstance(v, dict) else v for k, v in CRYSTALS.items()}
     for key, value in more.items():
-        table[key] = {**table[key], **value} if isinstance(value, Mapping) else value
+        table[key] = {**table.get(key, {}), **value} if isinstance(value, Mapping) else value
     faults = Faults("spec")
     spec = read_record(RigSpec, table, "", faults)
     faults.raise_any()
