@@ -110,8 +110,10 @@ def _spots(beats: _Beats, periods_ns: Sequence[float], span_ns: float, where: st
     import cv2
 
     if not beats.count or span_ns < TURNS * min(periods_ns):
-        raise DataError("too short a look to find the LED in", value=f"{where}: {span_ns / 1e6:.0f} ms",
-                        expected=f"at least {TURNS} periods", next="longer viewpoints, or led.spike, led.rgb")  # fmt: skip
+        raise DataError(
+            "too short a look to find the LED in", value=f"{where}: {span_ns / 1e6:.0f} ms",
+            expected=f"at least {TURNS} periods", next="longer viewpoints, or led.spike and led.rgb in the plan",
+        )  # fmt: skip
     amplitude, share = beats.told()
     able = (share >= BEATS) & (amplitude >= SWING)
     best = np.where(able, amplitude * share, 0)
@@ -123,5 +125,5 @@ def _spots(beats: _Beats, periods_ns: Sequence[float], span_ns: float, where: st
     _, labels = cv2.connectedComponents(core)
     rows, columns = np.nonzero(labels == labels[y, x])
     weight = amplitude[period, rows, columns]
-    middle = [float((v + 0.5) @ weight / weight.sum()) for v in (columns, rows)]
-    return [Spot(0, *middle, max(float(np.sqrt(len(rows) / np.pi)), 1.0))]
+    x_px, y_px = (float((v + 0.5) @ weight / weight.sum()) for v in (columns, rows))
+    return [Spot(0, x_px, y_px, max(float(np.sqrt(len(rows) / np.pi)), 1.0))]

@@ -64,7 +64,8 @@ def timeline(blinks: Blinks, beat: Beat, start_ns: int, add_ns: int) -> Timeline
     if not beat.period_ns:
         if (blinks.rising[1:] == blinks.rising[:-1]).any():
             raise DataError("some of an unsteady LED's edges were missed", value=f"{len(blinks.at_ns)} were seen")
-        return Timeline(blinks.at_ns + add_ns, blinks.rising, *(t + add_ns for t in blinks.span_ns), 0.0)
+        first, last = (t + add_ns for t in blinks.span_ns)
+        return Timeline(blinks.at_ns + add_ns, blinks.rising, first, last, 0.0)
     first, last = blinks.span_ns[0] - EXTEND_NS, blinks.span_ns[1] + EXTEND_NS
     turns = np.arange(np.floor((first - start_ns) / beat.period_ns) - 1, (last - start_ns) / beat.period_ns + 1)
     ons = start_ns + np.rint(turns * beat.period_ns).astype(np.int64)

@@ -71,7 +71,8 @@ def spike_blinks(streams: Iterable[SpikeStream], spots: Sequence[Spot]) -> Blink
     """
     counts, lost, t0, rate, pixels = _counts(streams, spots)
     tick_ns = NS / rate
-    level = np.convolve(counts, np.full(SMOOTH, 1 / SMOOTH), "same") if len(counts) >= 4 * SMOOTH else np.zeros(1)
+    weights = np.full(SMOOTH, 1 / SMOOTH)
+    level = np.convolve(counts.astype(np.float64), weights, "same") if len(counts) >= 4 * SMOOTH else np.zeros(1)
     off, on = (float(v) for v in np.percentile(level, (5, 95)))
     span = (t0, t0 + round(len(counts) * tick_ns))
     if on - off < CONTRAST * pixels:
@@ -147,10 +148,11 @@ def beat_of(views: Sequence[Blinks], period_ns: float = 0.0) -> Beat:
         period_ns: as far as known, to a tenth; 0: not at all.
 
     Raises:
-        DataError: no viewpoint shows a whole period, or another one than was said.
+        DataError: no viewpoint shows a whole period, another one than was said, or none though one was said.
 
     Edges:
-        An LED whose edges lie more than 0.2 ms (rms) from any even beat is not steady: its period is 0.
+        A light of which no period was said and whose edges lie more than 0.2 ms (rms) from any even beat is not steady:
+        its period is 0.
     """
     apart = [np.diff(v.at_ns[v.rising == way]) for v in views for way in (True, False)]
     steps = np.concatenate([np.zeros(0), *apart])
@@ -173,6 +175,12 @@ def beat_of(views: Sequence[Blinks], period_ns: float = 0.0) -> Beat:
         rest = own - design @ found
     rms = float(np.sqrt(np.mean(rest**2)))
     if rms > STEADY_NS or not 0 < on < period:
+        if period_ns:
+            raise DataError(
+                "what blinks keeps no even beat", value=f"{rms / 1e3:.0f} us rms from one of {period / 1e6:.1f} ms",
+                expected=f"at most {STEADY_NS / 1e3:.0f} us", cause="another place than the LED's, or a poor lamp",
+                next="the right led.spike; led.period_ms = 0 for a light that is not steady",
+            )  # fmt: skip
         return Beat(0.0, 0.0, (0,) * len(views), rms)
     if period_ns and abs(period / period_ns - 1) > WRONG:
         raise DataError("the LED has another period than the plan says", value=f"{period / 1e6:.1f} ms",

@@ -75,7 +75,7 @@ class Times:
         number = clip_number(name)
         if ("rgb", number) in self.sighted:
             return RgbTimes(self.clocks.fit("rgb", number, int(clip.start_ns[0])).model, "sights")
-        found = [
+        found = [] if self.take.plan.get("sync", {}).get("mode") == "optical" else [
             (session, row)
             for session in self.truth
             for row in session.get("rgb", ())
@@ -85,8 +85,8 @@ class Times:
         if not found:
             raise RefusedError(
                 "nothing ties this clip's frames to the rig's time", value=name,
-                expected="the LED panel in its view, read into marks.jsonl",
-                next="spikerig rig panel TAKE SPOTS.json reads it; without it frames and spikes cannot be paired",
+                expected="the LED panel, or the LED, in its view",
+                next="spikerig rig panel TAKE SPOTS.json reads a panel; without it frames and spikes cannot be paired",
             )  # fmt: skip
         session, row = found[-1]
         media, true = np.array(row["media_ns"], np.int64), np.array(row["true_ns"], np.int64)

@@ -50,8 +50,12 @@ def led_plan(plan: Mapping[str, Any]) -> LedPlan | None:
         return None
     try:
         names = {f.name for f in fields(LedPlan)}
-        told = {k: v for k, v in dict(plan.get("led") or {}).items() if k in names}
-        led = LedPlan(**{k: tuple(map(float, v)) if isinstance(v, list | tuple) else float(v) for k, v in told.items()})
+        told: dict[str, Any] = {
+            k: tuple(map(float, v)) if isinstance(v, list | tuple) else float(v)
+            for k, v in dict(plan.get("led") or {}).items()
+            if k in names
+        }
+        led = LedPlan(**told)
         if len(led.spike) % 2 or len(led.rgb) % 2 or not led.period_ms >= 0:
             raise ValueError("places are pairs of x and y, a period is not negative")
     except (TypeError, ValueError) as error:
