@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,13 +102,15 @@ def frame_sights(
     """
     seen = next(blocks(looks, spots, BLOCK), None)
     found = None if seen is None else shares(seen.light)
-    if seen is None or found is None:
+    if seen is None or found is None or not found[2].any():
         raise DataError("the LED does not blink in the clip", value=f"{len(spots)} places",
                         cause="another place, too dim, or it is not in view")  # fmt: skip
     if float(np.percentile(seen.light, 95)) > WHITE:
         raise DataError("the LED is clipped in the clip: its light tells no time", value="white",
                         next="a dimmer LED, or a piece of paper before it")  # fmt: skip
-    share, contrast = found
+    share, contrast, sure = found
+    share, contrast = share[:, sure], contrast[sure]
+    seen = replace(seen, light=seen.light[:, sure], noise=seen.noise[:, sure], row=seen.row[sure])
     step = int(max(seen.exposure_ns.min() // 8, 100_000))
     ahead = _ahead(seen, share, row_ns, line, between_ns, step)
     sd = np.hypot(seen.noise / contrast, 0.002)
