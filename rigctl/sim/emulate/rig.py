@@ -31,6 +31,7 @@ from spikerig.rigctl.sim.emulate.harpbox import BoxFaults, HarpBoxWire
 from spikerig.rigctl.sim.emulate.latency import Latency
 from spikerig.rigctl.sim.emulate.oscillator import Oscillator
 from spikerig.rigctl.sim.emulate.panel_light import PanelInView
+from spikerig.rigctl.sim.emulate.sensors import Sensors, effects_of
 from spikerig.rigctl.sim.emulate.serialport import device_errors
 from spikerig.rigctl.sim.emulate.spike_bench import bridge_of
 from spikerig.rigctl.sim.emulate.spikewire import SpikeWire
@@ -58,6 +59,8 @@ class RigSpec:
         start_s: the host's clock at first.
         spike: table of `spike_bench.bridge_of`, without the profile: the plan names it.
         rgb: ppm and the like of its crystal; nature, faults: tables of `gopro_camera`.
+        effects: of optics and sensors, as a scene file lists them, or "scene": those of the scene. They cost what
+            docs/effects.md says; none unless asked for.
         led: of a plan without a clock box: ppm and the like of the LED's crystal; period_ms, spike, rgb (x and y),
             radius_px, where they are not the plan's.
         box: ppm and the like; firmware, start_second; to_box, to_host: tables of `Latency`; faults: of `BoxFaults`.
@@ -70,6 +73,7 @@ class RigSpec:
     rgb: Any = limits({})
     box: Any = limits({})
     led: Any = limits({})
+    effects: Any = limits(())
 
 
 def load_rig_spec(path: str | Path) -> RigSpec:
@@ -119,6 +123,9 @@ def open_emulated(spec: RigSpec, plan: TakePlan, *, card: Path, after_ns: int = 
     wire = plan.profile
     size = (wire.width, wire.height)
     world = world_of(spec.scene, len(plan.viewpoints), size, wire.rate_hz, host, spec.seed or None)
+    if spec.effects:
+        effects = effects_of(spec.effects, world.spec, "the emulated rig's file")
+        world.sensors = Sensors(effects, world.camera, wire.rate_hz, spec.seed)
     box = _box(spec, host) if plan.sync.mode == "box" else None
     if box is not None and plan.panel is not None:
         world.panel = _panel(plan.panel, box, size)
