@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from emulated_takes import WIRE, plan_of, take
+from emulated_takes import WIRE, led_clocks, plan_of, take
 
 from spikerig.dataset.cli import run
 from spikerig.dataset.errors import UsageError
@@ -15,10 +15,7 @@ from spikerig.dataset.rawtake import open_take
 from spikerig.dataset.store import open_scene
 from spikerig.rigctl.forecast import forecast
 from spikerig.rigctl.ingest import ingest
-from spikerig.rigctl.ingest_led import led_sights
-from spikerig.rigctl.ingest_slips import mended
-from spikerig.rigctl.ingest_times import Framing, Times, read_truth
-from spikerig.rigctl.led_view import led_plan
+from spikerig.rigctl.ingest_times import read_truth
 from spikerig.rigctl.view_parts import Near
 
 SPEC = """
@@ -87,20 +84,8 @@ def folder(taken: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(taken, tmp_path / "take"))
 
 
-def read(folder: Path) -> tuple[Times, Any, Any]:
-    """The clocks of a take by its LED, what was read of it, and what really happened."""
-    raw = open_take(folder)
-    times = Times(raw, read_truth(raw))
-    wire, views = mended(raw, raw.views())
-    led = led_plan(raw.plan)
-    assert led is not None
-    found = led_sights(raw, views, led, times.marks, wire, Framing(wire, [s for v in views for s in v.spikes]))
-    times.fit(found.sights)
-    return times, found, read_truth(raw)
-
-
 def test_an_led_ties_every_frame_to_the_spikes(taken: Path) -> None:
-    times, found, truth = read(taken)
+    times, found, truth = led_clocks(taken)
     assert times.clocks.rig == "spike"
     assert found.missing == {}
     assert found.period_ns == pytest.approx(410e6 * (1 + 21e-6 - 40e-6), rel=1e-5)
@@ -153,7 +138,7 @@ def test_a_light_that_blinks_too_fast_is_refused_with_the_numbers(tmp_path: Path
     folder = tmp_path / "take"
     led = {"period_ms": 62.0, "spike": [41.0, 30.0], "rgb": [20.0, 13.0]}
     take(folder, plan_of(viewpoints=2, seconds=0.3, sync={"mode": "optical"}, led=led), led={"ppm": 5.0})
-    _, found, _ = read(folder)
+    _, found, _ = led_clocks(folder)
     assert sorted(found.missing) == ["000 rgb", "001 rgb"]
     for why in found.missing.values():
         assert "cannot be told" in why
@@ -168,7 +153,7 @@ def test_an_led_that_is_not_where_the_plan_has_it(folder: Path) -> None:
     told = json.loads((folder / "take.json").read_text())
     told["plan"]["led"] |= {"spike": [10.0, 40.0]}
     (folder / "take.json").write_text(json.dumps(told))
-    _, found, _ = read(folder)
+    _, found, _ = led_clocks(folder)
     assert sorted(found.missing) == ["000 spike", "001 spike", "002 spike"]
     assert any("no even beat" in why for why in found.missing.values()), found.missing
     assert found.sights == []
@@ -179,7 +164,7 @@ def test_stamps_that_contradict_a_clips_length(folder: Path) -> None:
     view = json.loads(lines[-1])
     view["clip"]["stop_ns"] = [t + 10**9 for t in view["clip"]["stop_ns"]]
     (folder / "views.jsonl").write_text("\n".join([*lines[:-1], json.dumps(view), ""]))
-    _, found, _ = read(folder)
+    _, found, _ = led_clocks(folder)
     assert list(found.missing) == [f"{view['name']} rgb"]
     assert "does not agree with its length" in found.missing[f"{view['name']} rgb"]
 

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from emulated_takes import plan_of, rig_of, take
+from emulated_takes import led_clocks, plan_of, rig_of, take
 
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.rawtake import open_take
 from spikerig.dataset.store import open_scene
 from spikerig.rigctl.ingest import ingest
-from spikerig.rigctl.ingest_times import Times, clip_number, read_truth
+from spikerig.rigctl.ingest_times import clip_number, read_truth
 from spikerig.rigctl.sim.emulate.sensors import Sensors, effects_of
 from spikerig.rigctl.sim.emulate.virtual import VirtualHost
 from spikerig.rigctl.sim.emulate.world import Ticker, world_of
@@ -44,7 +44,7 @@ def test_a_noisy_take_is_ingested_and_right_in_time(tmp_path: Path) -> None:
     assert told["rgb_times"] == {"sights": 2}
     with open_scene(tmp_path / "s.h5") as file:
         scene = file.read()
-    times = Times(raw, truth)
+    times, _, _ = led_clocks(folder)
     for taken, view in zip(raw.views(), scene.views, strict=True):
         (row,) = [r for r in truth[0]["rgb"] if r["event"] == "clip" and r["number"] == clip_number(taken.clips[0])]
         off = times.rig_from_true(truth[0], np.array(row["true_ns"])) - view.frame.start_ns
