@@ -14,6 +14,7 @@ from spikerig.calib.panel_read import Spot
 from spikerig.dataset.cli import run
 from spikerig.dataset.errors import DataError, RefusedError, UsageError
 from spikerig.dataset.kernels import count
+from spikerig.dataset.marks import Sight, read_marks
 from spikerig.dataset.rawtake import WireBytes, open_take, read_lines, verify_take
 from spikerig.dataset.segments import Chunk, scan
 from spikerig.dataset.store import open_scene, verify_scene
@@ -227,6 +228,10 @@ def test_the_panel_ties_frames_and_spikes_without_any_truth(tmp_path: Path) -> N
     assert told["sigma_us"] < 300
     with open_scene(tmp_path / "s.h5") as file:
         scene = file.read()
+    assert run(["rig", "panel", str(folder)]) == 0  # the same code, where the plan has the panel
+    marks = [m for m in read_marks(folder / "marks.jsonl") if isinstance(m, Sight)]
+    assert len(marks) == told["sights"]
+    assert ingest(folder, tmp_path / "again.h5")["sigma_us"] == told["sigma_us"]  # sights that are there count once
     times = Times(raw, truth)
     clips = {v.name: clip_number(v.clips[0]) for v in raw.views()}
     for view in scene.views:
