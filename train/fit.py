@@ -137,18 +137,23 @@ def fraction_done(state: State, config: FitConfig) -> float:
     return state.seconds / config.seconds if config.seconds > 0 else state.step / config.steps
 
 
-def one_step(state: State, task: Task, fraction: float) -> float:
-    """One look, one update; returns the loss. Random draws: view order by epoch, the rest by step."""
-    config, field = task.config, task.field
+def step_of(state: State, task: Task, fraction: float) -> tuple[TrainView, Step]:
+    """What the next step looks at, and its draws: view order by epoch, the rest by step."""
+    config = task.config
     rng = np.random.default_rng((config.seed, 2, state.step))
-    view = field.look(task.targets, task.camera, config, state.step, rng)
-    for p in state.params.values():
-        p.grad = None
+    view = task.field.look(task.targets, task.camera, config, state.step, rng)
     background = BACKGROUNDS[config.background]
     if config.background == "random":
         r, g, b = rng.uniform(0, 1, 3)
         background = (r, g, b)
-    step = Step(state.step, fraction, background, rng)
+    return view, Step(state.step, fraction, background, rng)
+
+
+def one_step(state: State, task: Task, fraction: float) -> float:
+    """One look, one update; returns the loss."""
+    for p in state.params.values():
+        p.grad = None
+    view, step = step_of(state, task, fraction)
     loss = view_loss(state, task, view, step)
     value = loss.item()
     if not np.isfinite(value):
@@ -158,7 +163,7 @@ def one_step(state: State, task: Task, fraction: float) -> float:
     _descend(state, task, fraction)
     if state.step % CHECK_EVERY == 0:
         check_finite(state)
-    field.tend(state, config, step)
+    task.field.tend(state, task.config, step)
     state.step += 1
     return value
 

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from spikerig.dataset.errors import DataError, UsageError
+from spikerig.dataset.errors import DataError, NumericsError, UsageError
 from spikerig.dataset.terminal import Progress, note
 from spikerig.train import record as records
 from spikerig.train.config import FitConfig
 from spikerig.train.fields import field_of
 from spikerig.train.fit import State, Task, check_finite, load_state, new_state, save_state, torch_threads, train
 from spikerig.train.gauge import gauge_of
+from spikerig.train.guard import Guard, copy_state, reproducer
 from spikerig.train.model import SplatModel, check_pinhole
 from spikerig.train.ply import export_ply
 from spikerig.train.score import Exam, mean_psnr, novel_views
@@ -75,11 +76,14 @@ def run_fit(
     record["prepare_seconds"] = time.monotonic() - begin
     _tell(task, record)
     records.write_json(out / records.RECORD, {**record, "steps": state.step, "train_seconds": state.seconds})
-    watch = _Watch(out, task, exams, eval_every, checkpoint_every)
+    watch = _Watch(out, task, exams, eval_every, checkpoint_every, Guard(copy_state(state)))
     if state.step == 0:
         watch.look(state, 0.0)
     try:
         train(state, task, after=watch)
+    except NumericsError as error:
+        note("not finite: looking for the first step that broke")
+        raise reproducer(out, watch.guard.kept, task, error) from error
     except KeyboardInterrupt:
         watch.save(state)
         note(f"stopped at step {state.step}; --resume goes on")
@@ -115,6 +119,27 @@ def prepare(
         "renders_per_step": {"ratio": 1 if targets.ratio else 0, "average": len({*targets.colour, *targets.tfs})},
     }
     return task, record
+
+
+def prepare_again(record: dict[str, Any], config: FitConfig, moved: Path | None = None) -> Task:
+    """The task of a stored run, from its run.json and config.
+
+    Args:
+        record: run.json.
+        config: of the run.
+        moved: where the scene is now; None: where it was.
+
+    Raises:
+        DataError: another scene than the run's, or none.
+    """
+    from spikerig.dataset.store import open_scene
+
+    path = Path(record["scene"]["path"]) if moved is None else moved
+    with open_scene(path) as scene, torch_threads():
+        if record["scene"]["sha256"] != records.scene_hash(path):
+            raise DataError("this is not the scene the run was made from", value=path, next="--scene FILE")
+        points_of = record.get("points_of")
+        return prepare(scene, path, config, _points(Path(points_of)) if points_of else None)[0]
 
 
 def _start(
@@ -186,6 +211,7 @@ class _Watch:
     exams: list[Exam]
     eval_every: float | None
     checkpoint_every: float
+    guard: Guard
     looked: float = 0.0
     saved: float = field(default_factory=time.monotonic)
     pause: float = 0.0  # after a save that took long: it may cost a twentieth of the time, not more
@@ -193,6 +219,7 @@ class _Watch:
 
     def __call__(self, state: State, fraction: float, loss: float) -> None:
         config = self.task.config
+        self.guard(state)
         if self.bar is None:
             total = round(config.seconds) if config.seconds > 0 else config.steps
             self.bar = Progress("training", total, "s" if config.seconds > 0 else "steps")
