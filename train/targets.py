@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from spikerig.calib.straight import Straight, straight_of
 from spikerig.dataset.bayer import bayer_of
 from spikerig.dataset.clocktime import ClockModel
-from spikerig.dataset.errors import DataError, UsageError
+from spikerig.dataset.errors import DataError, NumericsError, UsageError
 from spikerig.dataset.scene import Floats, View
 from spikerig.dataset.spikes import SpikeStream
 from spikerig.dataset.terminal import Progress
@@ -190,8 +190,9 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
         gauge: poses are given in it.
 
     Raises:
-        DataError: no training views, no spikes, no trajectory or no truth where the method needs it; a colour spike
-            camera.
+        DataError: no training views, nothing valid in them, no spikes, no trajectory or no truth where the method
+            needs it; a colour spike camera.
+        NumericsError: true light that is not finite.
         UsageError: single spikes are asked for, and the spike arm's lens bends.
     Cost: a texture takes milliseconds; memory 12 bytes a pixel and view, +4 a texture, +6 a ratio instant.
     """
@@ -224,6 +225,14 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
     for name in scene.train:
         raw.append(_read(scene, name, config, (colour, tfs, ratio, also), pairs, straight))
         bar.step()
+    if not any(each["valid"].any() for each in raw):
+        raise DataError(
+            "no pixel of any training view is valid",
+            value=scene.name,
+            expected="views whose two arms see something in common",
+            cause="an alignment that missed, or masks that are inverted",
+            next="spikerig data check FILE",
+        )
     gray = solve(pairs, config.gray, scene.light_gain) if config.needs_spikes else None
     views = tuple(_finish(each, k, config, gauge, gray, (colour, tfs, ratio)) for k, each in enumerate(raw))
     return Targets(views, colour, tfs, ratio, gray, _remarks(raw), also)
@@ -265,7 +274,7 @@ def _read(
         "textures": {},
     }
     if config.colour_target == "truth":
-        made["light"] = np.array(scene.truth_light(name), np.float32)
+        made["light"] = _finite(np.array(scene.truth_light(name), np.float32), name, scene)
         made["pose"] = dict.fromkeys(made["pose"], truth_pose(scene, view))
     if config.needs_spikes:
         clock = scene.clock
@@ -277,6 +286,20 @@ def _read(
             found = textures_at(view.spikes, tick, config.textures, config.texture_window)
             made["textures"][phase] = [straight.texture(t) for t in found]
     return made
+
+
+def _finite(light: NDArray[np.float32], name: str, scene: SceneFile) -> NDArray[np.float32]:
+    """True light as it is, if all of it is finite (a file that was changed since it was written may hold anything)."""
+    bad = np.argwhere(~np.isfinite(light))
+    if len(bad):
+        raise NumericsError(
+            f"the true light of view '{name}' is not finite",
+            value=f"{light[tuple(bad[0])]} at index {bad[0].tolist()}, {len(bad)} in all",
+            expected="finite numbers",
+            cause="a damaged file",
+            next=f"spikerig data verify {scene.path}",
+        )
+    return light
 
 
 def _finish(
