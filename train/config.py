@@ -24,7 +24,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "tfs_combine": ("average", "sum"),
     "tfs_domain": ("encoded", "linear", "luma", "naive"),
     "highlights": ("clip", "keep"),
-    "gray": ("calibrated", "rec601", "learned"),
+    "gray": ("calibrated", "rec601", "learned", "constrained", "response"),
     "weight_reading": ("mean", "sum-batch", "sum-image", "u8"),
     "device": ("cpu", "cuda"),
 }
@@ -63,7 +63,9 @@ class FitConfig:
     least noisy; `raw` = the spike bit itself). `tfs_domain`: encoded = sRGB of texture against sRGB
     of the gray of the linearised render; linear = both linear; luma = gray of the encoded render against the encoded
     texture; naive = gray of the encoded render against the linear texture (wrong, for the ablation). `highlights`:
-    clip textures to display white, where RGB ends too, or keep them.
+    clip textures to display white, where RGB ends too, or keep them. `gray`: how RGB becomes what a spike sees:
+    calibrated before training and frozen; rec601; learned (the paper's, free); constrained (learned, positive weights
+    of fixed sum); response (constrained, then a learned monotone curve). Learned ones start from Rec.601.
 
     Ratio: until `ratio_until` of the run the colour target is the frame times the ratio of the texture at one of
     `ratio_instants` instants (a random one a step) to the exposure's mean.

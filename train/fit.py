@@ -24,6 +24,7 @@ from spikerig.dataset.scene import Camera
 from spikerig.train import checkpoint
 from spikerig.train.adam import update
 from spikerig.train.config import FitConfig, effective_weight
+from spikerig.train.converter import LEARNED, converter, start_converter
 from spikerig.train.field import Field, Model, Step, Tensors
 from spikerig.train.fields import field_of
 from spikerig.train.gauge import Gauge
@@ -85,8 +86,8 @@ class Task:
 def new_state(points: Points | None, task: Task) -> State:
     """Step 0: the field's start, and the gray converter where it is learned."""
     params, grids = task.field.start(points, task.gauge, task.config)
-    if task.config.gray == "learned" and task.targets.gray is not None:
-        params = {**params, "gray": task.gray}
+    if task.config.gray in LEARNED and task.targets.gray is not None:
+        params = {**params, "gray": start_converter(task.config.gray, task.gray)}
     params = {**params, **start_parts(task)}
     leaves = {name: p.detach().clone().requires_grad_() for name, p in params.items()}
     moments = {name: (torch.zeros_like(p), torch.zeros_like(p)) for name, p in params.items()}
@@ -228,12 +229,14 @@ def _fresh(state: State, task: Task, view: TrainView, rng: np.random.Generator) 
 
 
 def _tfs_term(state: State, task: Task, view: TrainView, pictures: dict[float, Tensor]) -> Tensor:
-    gray = state.params.get("gray", task.gray)
+    gray, heights = task.gray, None
+    if "gray" in state.params:
+        gray, heights = converter(task.config.gray, state.params["gray"], task.gray)
     supervised = [phase for phase in pictures if view.instants[phase].textures]
     total = torch.zeros(())
     for phase in supervised:
         for texture, weight in view.instants[phase].textures:
-            total = total + tfs_loss(pictures[phase], texture, weight, gray, task.config.tfs_domain)
+            total = total + tfs_loss(pictures[phase], texture, weight, gray, task.config.tfs_domain, heights)
     return total / len(supervised) if len(supervised) > 1 else total
 
 

@@ -14,6 +14,7 @@ from spikerig.dataset.errors import DataError, NumericsError, UsageError
 from spikerig.dataset.terminal import Progress, note
 from spikerig.train import record as records
 from spikerig.train.config import FitConfig
+from spikerig.train.converter import converter
 from spikerig.train.fields import field_of
 from spikerig.train.fit import State, Task, check_finite, load_state, new_state, save_state, torch_threads, train
 from spikerig.train.gauge import gauge_of
@@ -268,7 +269,9 @@ def _finish(state: State, watch: _Watch, record: dict[str, Any], ply: bool) -> d
     if "means" in state.params:
         done["splats"] = len(state.params["means"])
     if "gray" in state.params:
-        done["learned_gray"] = state.params["gray"].tolist()
+        gray, heights = converter(watch.task.config.gray, state.params["gray"].detach(), watch.task.gray)
+        done["learned_gray"] = gray.tolist()
+        done["learned_response"] = None if heights is None else heights.tolist()
     records.write_json(watch.out / records.RECORD, {**record, **done})
     model = watch.task.model(state)
     if ply and isinstance(model, SplatModel):
