@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -57,12 +57,16 @@ class Model(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """What a field may need to know of a step: fraction of the run done, background, the step's random draws."""
+    """What a field may need to know of a step: fraction of the run done, background, the step's random draws.
+
+    Every draw appends what it cost to `drawn`: 1 a picture, or the number of rays.
+    """
 
     number: int
     fraction: float
     background: tuple[float, float, float]
     rng: np.random.Generator
+    drawn: list[int] = field(default_factory=list)
 
 
 class Field(Protocol):

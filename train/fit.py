@@ -45,6 +45,7 @@ class State:
     """What a fit changes: parameters and Adam's moments by name, the next step, seconds trained, held-out dB over time.
 
     `grids`: what the field keeps beside its parameters.
+    `cpu`: seconds of CPU, all threads; `renders`: pictures of splats, or rays, drawn for training so far.
     `memory`: linear light (float16[H,W,3]) of the last renders of sub-poses by (view, phase), where fresh_poses asks.
     """
 
@@ -55,6 +56,8 @@ class State:
     history: list[dict[str, Any]] = field(default_factory=list)
     memory: dict[tuple[str, float], Tensor] = field(default_factory=dict)
     grids: Tensors = field(default_factory=dict)
+    cpu: float = 0.0
+    renders: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,9 +129,10 @@ def train(
     """
     with torch_threads(task.field.torch_threads()):
         while (fraction := fraction_done(state, task.config)) < 1:
-            begin = time.perf_counter()
+            begin, worked = time.perf_counter(), time.process_time()
             loss = one_step(state, task, fraction)
             state.seconds += time.perf_counter() - begin
+            state.cpu += time.process_time() - worked
             after(state, fraction_done(state, task.config), loss)
     return state
 
@@ -166,6 +170,7 @@ def one_step(state: State, task: Task, fraction: float) -> float:
         check_finite(state)
     task.field.tend(state, task.config, step)
     state.step += 1
+    state.renders += sum(step.drawn)
     return value
 
 
@@ -293,6 +298,7 @@ def save_state(path: Path, state: State, config: FitConfig) -> None:
     tensors |= {f"grid/{n}": g for n, g in state.grids.items()}
     tensors |= {f"memory/{view}/{phase!r}": image for (view, phase), image in state.memory.items()}
     record = {"step": state.step, "seconds": state.seconds, "history": state.history, "config": config.as_json()}
+    record |= {"cpu": state.cpu, "renders": state.renders}
     checkpoint.save(path, tensors, record)
 
 
@@ -302,6 +308,7 @@ def load_state(path: Path) -> tuple[State, dict[str, Any]]:
     leaves = {n.removeprefix("param/"): p.requires_grad_() for n, p in tensors.items() if n.startswith("param/")}
     moments = {name: (tensors[f"adam/{name}/mean"], tensors[f"adam/{name}/square"]) for name in leaves}
     state = State(leaves, moments, int(record["step"]), float(record["seconds"]), list(record["history"]))
+    state.cpu, state.renders = float(record.get("cpu", 0.0)), int(record.get("renders", 0))
     state.grids = {n.removeprefix("grid/"): g for n, g in tensors.items() if n.startswith("grid/")}
     for name, image in tensors.items():
         if name.startswith("memory/"):

@@ -242,6 +242,7 @@ class _Watch:
         """Score the held-out views and add a point to history.json."""
         self.looked = fraction
         row: dict[str, Any] = {"seconds": state.seconds, "step": state.step, "fraction": fraction, "psnr": None}
+        row |= {"cpu_seconds": state.cpu, "renders": state.renders}
         if self.exams:
             row["psnr"] = mean_psnr(self.task.model(state), self.exams)
         state.history.append(row)
@@ -264,6 +265,9 @@ def _finish(state: State, watch: _Watch, record: dict[str, Any], ply: bool) -> d
         "status": "complete",
         "steps": state.step,
         "train_seconds": state.seconds,
+        "train_cpu_seconds": state.cpu,
+        "renders": state.renders,
+        "renders_of": "pictures" if watch.task.config.field == "splat" else "rays",
         "parameters": sum(p.numel() for p in state.params.values()),
     }
     if "means" in state.params:
