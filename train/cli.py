@@ -66,7 +66,8 @@ def fit(
     seed and steps give the same bits for any number of threads, also after a kill and --resume; a run that stops
     by seconds promises no bits.
     """
-    from spikerig.train.config import configure, parse_setting
+    from spikerig.train.config import parse_setting
+    from spikerig.train.methods import configure
     from spikerig.train.run import run_fit
 
     given: dict[str, Any] = {

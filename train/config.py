@@ -1,4 +1,4 @@
-"""One flat, frozen config of a fit; presets and methods are functions that return or adjust one.
+"""One flat, frozen config of a fit (presets and methods, which return or adjust one, are in methods.py).
 
 Every ambiguity of the paper is a named switch here, with its default. "w" always ends as a mean-equivalent weight:
 all loss terms are means over pixels, textures in [0,1] where 1 is display white.
@@ -6,12 +6,10 @@ all loss terms are means over pixels, textures in [0,1] where 1 is display white
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from spikerig.dataset.errors import UsageError
-from spikerig.train.raypresets import FAST, NERF, nerf, nerf_fast
 
 CHOICES: dict[str, tuple[str, ...]] = {
     "field": ("splat", "nerf", "nerf-fast"),
@@ -216,126 +214,6 @@ def from_json(record: dict[str, Any]) -> FitConfig:
             next="pip install --upgrade spikerig",
         )
     return FitConfig(**record)
-
-
-def draft() -> FitConfig:
-    """Minutes on two cores: 12k splats, one colour each, no densification."""
-    return FitConfig(preset="draft")
-
-
-def standard() -> FitConfig:
-    """A quarter of an hour at 400x250: 30k splats grown by MCMC, view-dependent colour of degree 1."""
-    return FitConfig(
-        preset="standard",
-        steps=10_000,
-        splats=30_000,
-        sh_degree=1,
-        densify="mcmc",
-        lr_end=0.1,
-        opacity_reg=0.01,
-        scale_reg=0.01,
-    )
-
-
-def full() -> FitConfig:
-    """Hours on a CPU: 100k splats, degree 3, antialiased, 30,000 steps."""
-    return replace(standard(), preset="full", steps=30_000, splats=100_000, sh_degree=3, antialias=True, lr_end=0.03)
-
-
-def paper() -> FitConfig:
-    """Field nerf as the paper has it: 200,000 steps of 1024 rays; weeks on a CPU, hours on a GPU."""
-    return FitConfig(preset="paper", steps=200_000)
-
-
-PRESETS: dict[str, Callable[[], FitConfig]] = {"draft": draft, "standard": standard, "full": full, "paper": paper}
-FIELDS: dict[str, tuple[Callable[[str], dict[str, Any]], Collection[str]]] = {  # settings by preset, presets
-    "splat": (lambda preset: {}, ("draft", "standard", "full")),
-    "nerf": (nerf, NERF),
-    "nerf-fast": (nerf_fast, FAST),
-}
-
-
-def plain(config: FitConfig) -> FitConfig:
-    """Blurry RGB, one pose a view: what anyone gets without spikes."""
-    return replace(config, method="plain")
-
-
-def average(config: FitConfig) -> FitConfig:
-    """Blurry RGB explained by 5 known sub-poses averaged in linear light: the honest baseline without spikes.
-
-    One of the five is rendered a step, as in spike-hybrid: at equal seconds that is its strongest form.
-    """
-    return replace(config, method="average", poses_per_view=5, fresh_poses=1)
-
-
-def spikenerf(config: FitConfig) -> FitConfig:
-    """The paper's TfS loss, 1x: one pose, one texture; L2 colour, as an L1 would keep pulling to the blur."""
-    return replace(config, method="spikenerf", colour_loss="l2", tfs_weight=20.0)
-
-
-def spikenerf_5x(config: FitConfig) -> FitConfig:
-    """The paper's 5x: 5 sub-poses rendered and averaged for colour, a texture at each."""
-    return replace(config, method="spikenerf-5x", poses_per_view=5, textures_per_view=5, tfs_weight=20.0)
-
-
-def spike_ratio(config: FitConfig) -> FitConfig:
-    """Ours: the frame times the ratio of texture to exposure mean, at a random instant of 5 a step."""
-    return replace(config, method="spike-ratio", ratio_until=1.0, textures="tfi-window", texture_window=24)
-
-
-def spike_hybrid(config: FitConfig) -> FitConfig:
-    """Ours, with colour restored: a short start by spike-ratio, then the 9-pose average with TfS, one render a step."""
-    return replace(
-        config,
-        method="spike-hybrid",
-        ratio_until=0.1,
-        ratio_instants=9,
-        poses_per_view=9,
-        textures_per_view=9,
-        fresh_poses=1,
-        tfs_weight=40.0,
-        textures="tfi-window",
-        texture_window=24,
-    )
-
-
-def oracle(config: FitConfig) -> FitConfig:
-    """The ceiling: sharp truth at the training poses (simulated scenes only)."""
-    return replace(config, method="oracle", colour_target="truth")
-
-
-METHODS: dict[str, Callable[[FitConfig], FitConfig]] = {
-    "plain": plain,
-    "average": average,
-    "spikenerf": spikenerf,
-    "spikenerf-5x": spikenerf_5x,
-    "spike-ratio": spike_ratio,
-    "spike-hybrid": spike_hybrid,
-    "oracle": oracle,
-}
-
-
-def configure(method: str = "plain", preset: str = "standard", field: str = "splat", **changes: Any) -> FitConfig:
-    """The config of a method at a preset on a field, with changes by name.
-
-    Raises:
-        UsageError: an unknown method, preset, field, setting or value; a setting of another field; what makes no sense.
-    """
-    for name, value, table in (("method", method, METHODS), ("preset", preset, PRESETS), ("field", field, FIELDS)):
-        if value not in table:
-            raise UsageError(f"no such {name}", value=value, expected=", ".join(table))
-    shape, presets = FIELDS[field]
-    if preset not in presets:
-        raise UsageError(f"field {field} has no such preset", value=preset, expected=", ".join(presets))
-    known = {f.name for f in fields(FitConfig)}
-    if strange := sorted(set(changes) - known):
-        raise UsageError("no such setting", value=", ".join(strange), expected=", ".join(sorted(known)))
-    other = {"splat": RAYS_ONLY, "nerf": SPLAT_ONLY | FAST_ONLY | {"sh_degree"}, "nerf-fast": SPLAT_ONLY}[field]
-    if strange := sorted(set(changes) & other):
-        raise UsageError(
-            f"field {field} has no use for these settings", value=", ".join(strange), next="leave them out"
-        )
-    return replace(METHODS[method](PRESETS[preset]()), **(shape(preset) | changes))
 
 
 def parse_setting(text: str) -> tuple[str, Any]:

@@ -81,8 +81,8 @@ class Field(Protocol):
         """What a step compares with: a view, or pixels of some."""
         ...
 
-    def draw(self, model: Any, view: TrainView, phase: float, step: Step) -> list[Tensor]:
-        """The view's renders at an instant, differentiable; each has a loss of its own, and they add up."""
+    def draw(self, model: Any, view: TrainView, pose: Tensor, step: Step) -> list[Tensor]:
+        """The view's renders from a pose (of each pixel, for a batch); each has a loss of its own, and they add up."""
         ...
 
     def rates(self, name: str, config: FitConfig) -> tuple[float, float | None]:

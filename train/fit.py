@@ -29,6 +29,7 @@ from spikerig.train.fields import field_of
 from spikerig.train.gauge import Gauge
 from spikerig.train.losses import average_exposure, l2_loss, light_of, mean_weights, tfs_loss
 from spikerig.train.model import BACKGROUNDS
+from spikerig.train.parts import exposed_by, part_of, parts_of, pose_of, start_parts
 from spikerig.train.ssim import l1_ssim
 from spikerig.train.targets import Targets, TrainView
 
@@ -86,6 +87,7 @@ def new_state(points: Points | None, task: Task) -> State:
     params, grids = task.field.start(points, task.gauge, task.config)
     if task.config.gray == "learned" and task.targets.gray is not None:
         params = {**params, "gray": task.gray}
+    params = {**params, **start_parts(task)}
     leaves = {name: p.detach().clone().requires_grad_() for name, p in params.items()}
     moments = {name: (torch.zeros_like(p), torch.zeros_like(p)) for name, p in params.items()}
     return State(leaves, moments, grids=grids)
@@ -167,7 +169,7 @@ def view_loss(state: State, task: Task, view: TrainView, step: Step) -> Tensor:
     model = task.model(state)
 
     def draw(phase: float) -> list[Tensor]:
-        images = task.field.draw(model, view, phase, step)
+        images = task.field.draw(model, view, pose_of(state.params, view, phase, config), step)
         if config.fresh_poses > 0:
             state.memory[view.name, phase] = light_of(images[0]).half()
         return images
@@ -179,7 +181,7 @@ def view_loss(state: State, task: Task, view: TrainView, step: Step) -> Tensor:
     else:
         drawn = {phase: draw(phase) for phase in _fresh(state, task, view, step.rng)}
     losses = [
-        _pictures_loss(state, task, view, {phase: images[k] for phase, images in drawn.items()}, ratio)
+        _pictures_loss(state, task, view, {phase: images[k] for phase, images in drawn.items()}, ratio, step)
         for k in range(len(next(iter(drawn.values()))))
     ]
     losses += task.field.regularise(state.params, config)
@@ -187,28 +189,32 @@ def view_loss(state: State, task: Task, view: TrainView, step: Step) -> Tensor:
 
 
 def _pictures_loss(
-    state: State, task: Task, view: TrainView, pictures: dict[float, Tensor], ratio: float | None
+    state: State, task: Task, view: TrainView, pictures: dict[float, Tensor], ratio: float | None, step: Step
 ) -> Tensor:
-    """Colour and TfS terms of one render at each instant; `ratio` is the instant of a ratio target."""
+    """All terms of one render at each instant; `ratio` is the instant of a ratio target."""
     config, targets = task.config, task.targets
     drawn = [pictures[p] for p in targets.colour if p in pictures]
     if ratio is not None:
-        loss = colour_loss(pictures[ratio], view.instants[ratio].ratio.float(), view.valid, config)
+        exposed = exposed_by(state.params, view, pictures[ratio], config)
+        loss = colour_loss(exposed, view.instants[ratio].ratio.float(), view.valid, config)
     elif drawn:
         kept = [state.memory[view.name, p] for p in targets.colour if p not in pictures]
         others = sum((light.float() for light in kept[1:]), kept[0].float()) if kept else None
-        exposed = average_exposure(drawn, others, len(targets.colour))
+        exposed = exposed_by(state.params, view, average_exposure(drawn, others, len(targets.colour)), config)
         loss = len(targets.colour) / len(drawn) * colour_loss(exposed, view.frame, view.valid, config)
     else:  # only an instant with textures and no part in the average
         loss = torch.zeros(())
     if task.weight > 0:
         loss = loss + task.weight * _tfs_term(state, task, view, pictures)
+    for part in parts_of(config):
+        if part.loss is not None:
+            loss = sum(part.loss(state, task, view, pictures, step), loss)
     return loss
 
 
 def _fresh(state: State, task: Task, view: TrainView, rng: np.random.Generator) -> list[float]:
     """The instants to render in a step: all, or `fresh_poses` random ones and those never rendered before."""
-    wanted = list(dict.fromkeys((*task.targets.colour, *task.targets.tfs)))
+    wanted = list(dict.fromkeys((*task.targets.colour, *task.targets.tfs, *task.targets.also)))
     k = task.config.fresh_poses
     if k == 0 or k >= len(wanted):
         return wanted
@@ -237,6 +243,11 @@ def _descend(state: State, task: Task, fraction: float) -> None:
     config = task.config
     decay = config.lr_end ** min(fraction, 1.0)
     for name, p in state.params.items():
+        if (owner := part_of(config, name)) is not None:
+            part, short = owner
+            rate = 0.0 if part.rate is None else part.rate(short, config, min(fraction, 1.0))
+            update(p, state.moments[name], state.step + 1, rate, head=3, rest=None)
+            continue
         base, share = (config.lr_gray, None) if name == "gray" else task.field.rates(name, config)
         rate = base * decay
         update(p, state.moments[name], state.step + 1, rate, head=3, rest=None if share is None else rate * share)

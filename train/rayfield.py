@@ -133,13 +133,15 @@ class RayField:
             valid,
             {phase: _instant([(v.instants[phase], p) for v, p in pairs]) for phase in views[0].instants},
             torch.cat(taken),
+            torch.cat([view.which.expand(len(p)) for view, p in pairs]),
+            {name: torch.cat([v.beside[name].flatten(0, 1)[p] for v, p in pairs])[:, None] for name in views[0].beside},
         )
 
-    def draw(self, model: RayModel, view: TrainView, phase: float, step: Step) -> list[Tensor]:
-        """The pixels at an instant, by every network: pictures of B rows and one column."""
+    def draw(self, model: RayModel, view: TrainView, pose: Tensor, step: Step) -> list[Tensor]:
+        """The pixels from their poses, by every network: pictures of B rows and one column."""
         if view.pixels is None:
             raise ValueError("a batch of pixels, as look() makes it")
-        rays = rays_of(model.camera, view.instants[phase].pose, view.pixels)
+        rays = rays_of(model.camera, pose, view.pixels)
         return [seen.colour[:, None].contiguous() for seen in model.trace(rays, step.background, step.rng)]
 
     def rates(self, name: str, config: FitConfig) -> tuple[float, float | None]:

@@ -49,12 +49,12 @@ class SplatField:
 
         return views_of_step(targets, config.seed, step)[0]
 
-    def draw(self, model: SplatModel, view: TrainView, phase: float, step: Step) -> list[Tensor]:
+    def draw(self, model: SplatModel, view: TrainView, pose: Tensor, step: Step) -> list[Tensor]:
         """One picture."""
         config = model.config
         rows = config.sh_degree + 1
         degree = min(config.sh_degree, int(step.fraction / max(config.sh_warmup, 1e-9) * rows))
-        return [model.draw(view.instants[phase].pose, step.background, degree).image]
+        return [model.draw(pose, step.background, degree).image]
 
     def rates(self, name: str, config: FitConfig) -> tuple[float, float | None]:
         """The config's rate of each tensor; a twentieth for view-dependent colour."""
@@ -73,7 +73,7 @@ class SplatField:
         """MCMC: dead splats go to live ones, all are jolted."""
         if config.densify != "mcmc":
             return
-        splats = {n: p for n, p in state.params.items() if n != "gray"}
+        splats = {n: state.params[n] for n in RATES}
         if step.number > 0 and step.number % config.densify_every == 0 and step.fraction < config.densify_until:
             with torch.no_grad():
                 splats, moments = relocate(splats, {n: state.moments[n] for n in splats}, config.splats, step.rng)

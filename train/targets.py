@@ -21,6 +21,7 @@ from spikerig.train.config import FitConfig
 from spikerig.train.gauge import Gauge
 from spikerig.train.gray import Gray, Pairs, solve
 from spikerig.train.losses import mean_weights, ratio_target, srgb_from_linear
+from spikerig.train.parts import parts_of
 from spikerig.train.trajectory import phases, pose_at, sub_pose
 
 if TYPE_CHECKING:
@@ -47,8 +48,10 @@ class Instant:
 class TrainView:
     """A training view: colour target float32[H,W,3] codes, valid bool[H,W] or None for all, instants by phase.
 
+    `which` int64[1] is the view's number among the training views; `beside` holds what parts read of it, [H,W,...].
+
     Or B pixels of some views, as pictures of B rows and one column: then `pixels` int64[B] says which (row * width +
-    column), and an instant's pose is [B,3,4].
+    column), `which` is int64[B], and an instant's pose is [B,3,4].
     """
 
     name: str
@@ -56,11 +59,16 @@ class TrainView:
     valid: torch.Tensor | None
     instants: dict[float, Instant]
     pixels: torch.Tensor | None = None
+    which: torch.Tensor = field(default_factory=lambda: torch.zeros(1, dtype=torch.int64))
+    beside: dict[str, torch.Tensor] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class Targets:
-    """All training views, the instants each term uses (fractions of the exposure), the converter, remarks."""
+    """All training views, the instants each term uses (fractions of the exposure), the converter, remarks.
+
+    `also`: further instants that parts ask for.
+    """
 
     views: tuple[TrainView, ...]
     colour: tuple[float, ...]
@@ -68,6 +76,7 @@ class Targets:
     ratio: tuple[float, ...]
     gray: Gray | None
     remarks: tuple[str, ...] = field(default=())
+    also: tuple[float, ...] = field(default=())
 
 
 def views_of_step(targets: Targets, seed: int, step: int, count: int = 1) -> list[TrainView]:
@@ -209,13 +218,15 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
     ratio = phases(config.ratio_instants, "midpoints", config.pose_label) if config.ratio_until > 0 else ()
     if config.ratio_until >= 1:
         colour, tfs = ratio, (ratio if tfs else ())
+    parts = parts_of(config)
+    also = tuple(dict.fromkeys(p for part in parts if part.instants is not None for p in part.instants(config)))
     pairs, raw, bar = Pairs(), [], Progress("preparing views", len(scene.train), "views")
     for name in scene.train:
-        raw.append(_read(scene, name, config, (colour, tfs, ratio), pairs, straight))
+        raw.append(_read(scene, name, config, (colour, tfs, ratio, also), pairs, straight))
         bar.step()
     gray = solve(pairs, config.gray, scene.light_gain) if config.needs_spikes else None
-    views = tuple(_finish(each, config, gauge, gray, (colour, tfs, ratio)) for each in raw)
-    return Targets(views, colour, tfs, ratio, gray, _remarks(raw))
+    views = tuple(_finish(each, k, config, gauge, gray, (colour, tfs, ratio)) for k, each in enumerate(raw))
+    return Targets(views, colour, tfs, ratio, gray, _remarks(raw), also)
 
 
 def _remarks(raw: list[dict[str, Any]]) -> tuple[str, ...]:
@@ -238,7 +249,7 @@ def _read(
 ) -> dict[str, Any]:
     from spikerig.dataset.images import linear_from_srgb
 
-    colour, tfs, ratio = instants
+    colour, tfs, ratio, also = instants
     view = scene.view(name, spikes=config.needs_spikes)
     decode = np.arange(view.frame.full + 1) / view.frame.full
     if view.frame.transfer == "srgb":
@@ -249,7 +260,8 @@ def _read(
         "light": light,
         "valid": np.array(view.valid),
         "row_ns": view.frame.row_ns,
-        "pose": {phase: sub_pose(view, phase) for phase in dict.fromkeys((*colour, *tfs, *ratio))},
+        "pose": {phase: sub_pose(view, phase) for phase in dict.fromkeys((*colour, *tfs, *ratio, *also))},
+        "beside": {n: t for part in parts_of(config) if part.read for n, t in part.read(scene, view, config).items()},
         "textures": {},
     }
     if config.colour_target == "truth":
@@ -268,7 +280,12 @@ def _read(
 
 
 def _finish(
-    raw: dict[str, Any], config: FitConfig, gauge: Gauge, gray: Gray | None, instants: tuple[tuple[float, ...], ...]
+    raw: dict[str, Any],
+    number: int,
+    config: FitConfig,
+    gauge: Gauge,
+    gray: Gray | None,
+    instants: tuple[tuple[float, ...], ...],
 ) -> TrainView:
     _, tfs, ratio = instants
     light, valid = torch.from_numpy(raw["light"]), raw["valid"]
@@ -294,7 +311,8 @@ def _finish(
                 ).half()
         made[phase] = Instant(torch.from_numpy(gauge.pose(pose)), textures, target)
     everywhere = None if valid.all() else torch.from_numpy(valid)
-    return TrainView(raw["name"], srgb_from_linear(clipped).contiguous(), everywhere, made)
+    which = torch.tensor([number])
+    return TrainView(raw["name"], srgb_from_linear(clipped).contiguous(), everywhere, made, None, which, raw["beside"])
 
 
 def _tfs_target(

@@ -9,10 +9,10 @@ from spikerig import _native
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.scene import Camera
 from spikerig.train import ray_oracles
-from spikerig.train.config import configure
 from spikerig.train.hashed import EMPTY, density_of, place, refresh, start_hashed, trace_hashed
 from spikerig.train.hashgrid import hash_encode, hash_encode_torch, layout_of
 from spikerig.train.layers import harmonics, waves
+from spikerig.train.methods import configure
 from spikerig.train.rays import BOX, Rays, bounds, rays_of
 from spikerig.train.volume import composite, inverse_cdf, stratified, weights_of
 

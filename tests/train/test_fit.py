@@ -13,8 +13,8 @@ import torch
 from spikerig.dataset.errors import NumericsError, UsageError
 from spikerig.dataset.store import open_scene
 from spikerig.train import checkpoint, run
-from spikerig.train.config import METHODS, configure
 from spikerig.train.fit import check_finite, load_state, save_state
+from spikerig.train.methods import METHODS, configure
 from spikerig.train.record import open_run
 from spikerig.train.run import run_fit
 from spikerig.train.score import score_run

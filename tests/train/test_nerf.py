@@ -10,8 +10,8 @@ import torch
 from spikerig import _native
 from spikerig.dataset.errors import HostError, NumericsError, UsageError
 from spikerig.dataset.store import open_scene
-from spikerig.train.config import configure
 from spikerig.train.fit import load_state, new_state, one_step, train
+from spikerig.train.methods import configure
 from spikerig.train.record import open_run
 from spikerig.train.render import render_path
 from spikerig.train.run import model_hash, prepare, run_fit
@@ -230,12 +230,12 @@ def test_a_batch_holds_the_views_own_pixels(tiny):
 
 
 def test_all_fields_are_timed_side_by_side(tiny, monkeypatch):
-    from spikerig.train import config, fieldcost
+    from spikerig.train import config, fieldcost, methods
 
     def tiny_field(method, preset, name, seed):
         return small(name, method, seed=seed) if name != "splat" else config.FitConfig(preset="draft", splats=50)
 
-    monkeypatch.setattr(config, "configure", tiny_field)
+    monkeypatch.setattr(methods, "configure", tiny_field)
     rows = fieldcost.field_cost(tiny, method="plain", preset="draft", rounds=1)
     assert [row["field"] for row in rows] == ["splat", "nerf-fast", "nerf"]
     assert [row["timed_steps"] for row in rows] == [30, 30, 1]
