@@ -1,4 +1,4 @@
-"""Densification by screen gradients (Kerbl et al. 2023): clone small splats, split large ones, drop faint and huge ones.
+"""Densification by screen gradients (Kerbl et al. 2023): small splats are cloned, large ones split, faint ones dropped.
 
 What is watched goes from one round to the next in the fit's grids, so a resumed run repeats it; all draws come from the
 generator that is handed in.
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from spikerig.train.splat import Rendered
 
 SUM, SEEN = "grow/sum", "grow/seen"  # in the grids: [N] summed gradients and how many steps saw the splat
+LARGEST = 30.0  # log scales are clamped to it when drawn; beyond, places would overflow
 SPLIT = 1.6  # a split splat's halves are so much smaller
 RESET = 2 * DEAD  # opacity that a reset leaves at most
 Moments = dict[str, tuple[Tensor, Tensor]]
@@ -60,10 +61,10 @@ def watch(grids: dict[str, Tensor], drawn: list[Rendered], grads: list[Tensor]) 
     mean over the steps that saw the splat. Sub-poses add up first: together they are one look at the view.
     """
     height, width = drawn[0].image.shape[:2]
-    total = grads[0].clone()
+    total = grads[0].reshape(-1, 2).cpu().clone()
     seen = drawn[0].visible
     for picture, grad in zip(drawn[1:], grads[1:], strict=True):
-        total += grad
+        total += grad.reshape(-1, 2).cpu()
         seen = seen | picture.visible
     grids[SUM] += torch.hypot(total[:, 0] * (width / 2), total[:, 1] * (height / 2)) * seen
     grids[SEEN] += seen
@@ -119,7 +120,7 @@ def _scatter(params: dict[str, Tensor], halves: Tensor, rng: np.random.Generator
     if len(halves) == 0:
         return
     draw = torch.from_numpy(rng.standard_normal((len(halves), 3)).astype(np.float32))
-    inside = draw * params["log_scales"][halves].exp()
+    inside = draw * params["log_scales"][halves].clamp(max=LARGEST).exp()
     params["means"][halves] += (rotations(params["quats"][halves]) * inside[:, None, :]).sum(2)
     params["log_scales"][halves] -= float(np.log(SPLIT))
 

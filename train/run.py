@@ -18,6 +18,7 @@ from spikerig.train.fields import field_of
 from spikerig.train.fit import State, Task, check_finite, load_state, new_state, save_state, torch_threads, train
 from spikerig.train.gauge import gauge_of
 from spikerig.train.model import SplatModel, check_pinhole
+from spikerig.train.parts import parts_of
 from spikerig.train.ply import export_ply
 from spikerig.train.score import Exam, mean_psnr, novel_views
 from spikerig.train.targets import load_targets
@@ -111,7 +112,7 @@ def prepare(
     record |= {
         "gray": None if found is None else found.as_json(),
         "effective_tfs_weight": task.weight,
-        "remarks": list(targets.remarks),
+        "remarks": [*targets.remarks, *(part.remark for part in parts_of(config) if part.remark)],
         "renders_per_step": {"ratio": 1 if targets.ratio else 0, "average": len({*targets.colour, *targets.tfs})},
     }
     return task, record
