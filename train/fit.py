@@ -164,6 +164,7 @@ def one_step(state: State, task: Task, fraction: float) -> float:
     if not np.isfinite(value):
         raise _not_finite(state, f"the loss of view '{view.name}' is {value}")
     if loss.requires_grad:
+        field.sense(config, step)
         loss.backward()
     _descend(state, task, fraction)
     if state.step % CHECK_EVERY == 0:
@@ -215,11 +216,14 @@ def _pictures_loss(
         loss = len(targets.colour) / len(drawn) * colour_loss(exposed, view.frame, view.valid, config)
     else:  # only an instant with textures and no part in the average
         loss = torch.zeros(())
-    if task.weight > 0:
-        loss = loss + task.weight * _tfs_term(state, task, view, pictures)
+    step.note("colour", loss)
+    if task.weight > 0 and step.fraction >= config.tfs_from:
+        step.note("tfs", task.weight * _tfs_term(state, task, view, pictures))
+        loss = loss + step.notes["tfs"][-1]
     for part in parts_of(config):
         if part.loss is not None:
-            loss = sum(part.loss(state, task, view, pictures, step), loss)
+            step.note("parts", sum(part.loss(state, task, view, pictures, step), torch.zeros(())))
+            loss = loss + step.notes["parts"][-1]
     return loss
 
 

@@ -20,6 +20,7 @@ from spikerig.train.fit import State, Task, check_finite, load_state, new_state,
 from spikerig.train.gauge import gauge_of
 from spikerig.train.guard import Guard, copy_state, reproducer
 from spikerig.train.model import SplatModel, check_pinhole
+from spikerig.train.parts import parts_of
 from spikerig.train.ply import export_ply
 from spikerig.train.score import Exam, mean_psnr, novel_views
 from spikerig.train.targets import load_targets
@@ -116,7 +117,7 @@ def prepare(
     record |= {
         "gray": None if found is None else found.as_json(),
         "effective_tfs_weight": task.weight,
-        "remarks": list(targets.remarks),
+        "remarks": [*targets.remarks, *(part.remark for part in parts_of(config) if part.remark)],
         "renders_per_step": {"ratio": 1 if targets.ratio else 0, "average": len({*targets.colour, *targets.tfs})},
     }
     return task, record
