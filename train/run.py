@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +13,7 @@ import torch
 from spikerig.dataset.errors import DataError, NumericsError, UsageError
 from spikerig.dataset.terminal import Progress, note
 from spikerig.train import record as records
+from spikerig.train.bridge import Cameras, bridge, true_pose
 from spikerig.train.config import FitConfig
 from spikerig.train.converter import converter
 from spikerig.train.fields import field_of
@@ -21,9 +22,11 @@ from spikerig.train.gauge import gauge_of
 from spikerig.train.guard import Guard, copy_state, reproducer
 from spikerig.train.model import SplatModel, check_pinhole
 from spikerig.train.parts import parts_of
+from spikerig.train.path import MIDDLE, paths
 from spikerig.train.ply import export_ply
 from spikerig.train.score import Exam, mean_psnr, novel_views
 from spikerig.train.targets import load_targets
+from spikerig.train.trajectory import PATH_PHASES
 
 if TYPE_CHECKING:
     from spikerig.dataset.scene import Points
@@ -75,10 +78,11 @@ def run_fit(
         record["points_of"] = None if points_of is None else str(points_of)
         state = _start(out, scene, task, resume, points, record["points_of"])
         exams = _exams(scene) if score_on is None else _exams_of(score_on, scene)
+        known = {name: true_pose(scene, name) for name in scene.train} if config.moves_cameras else {}
     record["prepare_seconds"] = time.monotonic() - begin
     _tell(task, record)
-    records.write_json(out / records.RECORD, {**record, "steps": state.step, "train_seconds": state.seconds})
-    watch = _Watch(out, task, exams, eval_every, checkpoint_every, Guard(copy_state(state)))
+    watch = _Watch(out, task, record, exams, known, eval_every, checkpoint_every, Guard(copy_state(state)))
+    watch.write(state)
     if state.step == 0:
         watch.look(state, 0.0)
     try:
@@ -210,7 +214,9 @@ class _Watch:
 
     out: Path
     task: Task
+    record: dict[str, Any]
     exams: list[Exam]
+    known: Cameras  # where the world of the exams has the training cameras, where the fit moves them
     eval_every: float | None
     checkpoint_every: float
     guard: Guard
@@ -245,15 +251,36 @@ class _Watch:
         row: dict[str, Any] = {"seconds": state.seconds, "step": state.step, "fraction": fraction, "psnr": None}
         row |= {"cpu_seconds": state.cpu, "renders": state.renders}
         if self.exams:
-            row["psnr"] = mean_psnr(self.task.model(state), self.exams)
+            row["psnr"] = mean_psnr(self.task.model(state), self._brought_over(state))
         state.history.append(row)
         records.write_json(self.out / records.HISTORY, state.history)
 
+    def _brought_over(self, state: State) -> list[Exam]:
+        """The exams in the world of the cameras as they are now, by the training cameras alone (as `train score`)."""
+        if not self.known:
+            return self.exams
+        found = bridge(self.known, {n: each[MIDDLE] for n, each in paths(state, self.task).items()}, estimated=True)
+        return [replace(exam, pose=found.pose(exam.pose)) for exam in self.exams]
+
+    def write(self, state: State, done: dict[str, Any] | None = None) -> None:
+        """Write run.json, and where cameras move, paths.json."""
+        moved: dict[str, Any] = {}
+        if self.task.config.moves_cameras:
+            found = paths(state, self.task)
+            moved = {"cameras": {name: each[MIDDLE].tolist() for name, each in found.items()}}
+            views = {name: each.reshape(len(each), 12).tolist() for name, each in found.items()}
+            record = {"schema": "spikerig.paths/1", "phases": PATH_PHASES, "cam_from_world": views}
+            records.write_json(self.out / records.PATHS, record)
+        done = done or {"steps": state.step, "train_seconds": state.seconds}
+        records.write_json(self.out / records.RECORD, {**self.record, **moved, **done})
+
     def save(self, state: State) -> None:
-        """Write a checkpoint."""
+        """Write a checkpoint; run.json beside it where cameras move, so that both tell of the same step."""
         check_finite(state)
         begin = time.monotonic()
         save_state(self.out / records.CHECKPOINT, state, self.task.config)
+        if self.task.config.moves_cameras:
+            self.write(state)
         self.saved = time.monotonic()
         self.pause = 20 * (self.saved - begin)
 
@@ -277,7 +304,7 @@ def _finish(state: State, watch: _Watch, record: dict[str, Any], ply: bool) -> d
         gray, heights = converter(watch.task.config.gray, state.params["gray"].detach(), watch.task.gray)
         done["learned_gray"] = gray.tolist()
         done["learned_response"] = None if heights is None else heights.tolist()
-    records.write_json(watch.out / records.RECORD, {**record, **done})
+    watch.write(state, done)
     model = watch.task.model(state)
     if ply and isinstance(model, SplatModel):
         export_ply(watch.out / "splats.ply", model.splats, model.gauge, force=True)

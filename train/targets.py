@@ -22,7 +22,7 @@ from spikerig.train.gauge import Gauge
 from spikerig.train.gray import Gray, Pairs, solve
 from spikerig.train.losses import mean_weights, ratio_target, srgb_from_linear
 from spikerig.train.parts import parts_of
-from spikerig.train.trajectory import phases, pose_at, sub_pose
+from spikerig.train.trajectory import PATH_PHASES, given_pose, phases, pose_at
 
 if TYPE_CHECKING:
     from spikerig.dataset.store import SceneFile
@@ -67,7 +67,8 @@ class TrainView:
 class Targets:
     """All training views, the instants each term uses (fractions of the exposure), the converter, remarks.
 
-    `also`: further instants that parts ask for.
+    `also`: further instants that parts ask for. `given`: where cameras move, the poses [N,5,3,4] of the world that the
+    fit was given at PATH_PHASES.
     """
 
     views: tuple[TrainView, ...]
@@ -77,6 +78,7 @@ class Targets:
     gray: Gray | None
     remarks: tuple[str, ...] = field(default=())
     also: tuple[float, ...] = field(default=())
+    given: Floats = field(default_factory=lambda: np.zeros((0, len(PATH_PHASES), 3, 4)))
 
 
 def views_of_step(targets: Targets, seed: int, step: int, count: int = 1) -> list[TrainView]:
@@ -222,8 +224,8 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
     parts = parts_of(config)
     also = tuple(dict.fromkeys(p for part in parts if part.instants is not None for p in part.instants(config)))
     pairs, raw, bar = Pairs(), [], Progress("preparing views", len(scene.train), "views")
-    for name in scene.train:
-        raw.append(_read(scene, name, config, (colour, tfs, ratio, also), pairs, straight))
+    for number, name in enumerate(scene.train):
+        raw.append(_read(scene, name, number, config, gauge, (colour, tfs, ratio, also), pairs, straight))
         bar.step()
     if not any(each["valid"].any() for each in raw):
         raise DataError(
@@ -235,7 +237,8 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
         )
     gray = solve(pairs, config.gray, scene.light_gain) if config.needs_spikes else None
     views = tuple(_finish(each, k, config, gauge, gray, (colour, tfs, ratio)) for k, each in enumerate(raw))
-    return Targets(views, colour, tfs, ratio, gray, _remarks(raw), also)
+    given = [each["given"] for each in raw] if config.moves_cameras else np.zeros((0, len(PATH_PHASES), 3, 4))
+    return Targets(views, colour, tfs, ratio, gray, _remarks(raw), also, np.array(given))
 
 
 def _remarks(raw: list[dict[str, Any]]) -> tuple[str, ...]:
@@ -251,7 +254,9 @@ def _remarks(raw: list[dict[str, Any]]) -> tuple[str, ...]:
 def _read(
     scene: SceneFile,
     name: str,
+    number: int,
     config: FitConfig,
+    gauge: Gauge,
     instants: tuple[tuple[float, ...], ...],
     pairs: Pairs,
     straight: Straight,
@@ -269,13 +274,18 @@ def _read(
         "light": light,
         "valid": np.array(view.valid),
         "row_ns": view.frame.row_ns,
-        "pose": {phase: sub_pose(view, phase) for phase in dict.fromkeys((*colour, *tfs, *ratio, *also))},
+        "pose": {
+            phase: given_pose(view, number, phase, config, gauge.scale)
+            for phase in dict.fromkeys((*colour, *tfs, *ratio, *also))
+        },
         "beside": {n: t for part in parts_of(config) if part.read for n, t in part.read(scene, view, config).items()},
         "textures": {},
     }
     if config.colour_target == "truth":
         made["light"] = _finite(np.array(scene.truth_light(name), np.float32), name, scene)
         made["pose"] = dict.fromkeys(made["pose"], truth_pose(scene, view))
+    if config.moves_cameras:
+        made["given"] = [given_pose(view, number, phase, config, gauge.scale) for phase in PATH_PHASES]
     if config.needs_spikes:
         clock = scene.clock
         mean = straight.texture(exposure_mean(view, clock))
