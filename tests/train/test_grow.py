@@ -69,7 +69,8 @@ def test_halves_are_drawn_from_the_splat_itself():
 def test_faint_and_huge_splats_are_dropped_with_their_moments():
     p = sized(0.05, 0.05, 3.0, 0.05)
     p["logit_opacities"][1] = -9.0
-    m = {name: (torch.arange(4.0).reshape(-1, *[1] * (t.ndim - 1)).expand_as(t),) * 2 for name, t in p.items()}
+    ids = {name: torch.arange(4.0).reshape(-1, *[1] * (t.ndim - 1)).expand_as(t) for name, t in p.items()}
+    m = {name: (t, t) for name, t in ids.items()}
     left, kept = grow(p, m, blank(4), Rule(1.0, 0.1, 1000, huge=1.0), rng())
     assert torch.equal(left["means"], p["means"][[0, 3]])
     assert kept["sh"][0].flatten()[0::3].tolist() == [0.0, 3.0]
