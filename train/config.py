@@ -26,7 +26,11 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "tfs_combine": ("average", "sum"),
     "tfs_domain": ("encoded", "linear", "luma", "naive"),
     "highlights": ("clip", "keep"),
-    "gray": ("calibrated", "rec601", "learned"),
+    "gray": ("calibrated", "rec601", "learned", "constrained", "response"),
+    "trajectory": ("given", "linear", "cubic"),
+    "knots_at": ("even", "spikes"),
+    "path_from": ("given", "mid"),
+    "anchor": ("mean", "mid", "none"),
     "weight_reading": ("mean", "sum-batch", "sum-image", "u8"),
     "device": ("cpu", "cuda"),
 }
@@ -69,13 +73,27 @@ class FitConfig:
     at random, and remembers the last renders of the others (the gradient is scaled by n/k): the average at the cost
     of k renders a step instead of n.
 
+    Paths: `trajectory` given trains no camera. With linear or cubic, every training camera's pose is that given times
+    an SE(3) spline in its frame that is optimised with the scene: screws between `knots` knots (0: 2), or a cumulative
+    cubic B-spline of as many control poses (0: 4). Knots lie evenly over the exposure (`knots_at` even), or the pieces
+    of the spline end at the instants of the textures (spikes; `knots` is 0 then). `path_from` given starts at the
+    scene's trajectory, or at the mid-exposure pose, which then stands for all instants, where it has none; mid always
+    does the latter. `anchor` mean: what all cameras do in common (a motion, a scale) is projected out; mid:
+    mid-exposure poses hold, only the motion around them is learned; none. Rates `lr_poses` (radians and the normalised
+    scene's units) fall to `lr_poses_end` times that. For studies, `pose_noise_deg` degrees and `pose_noise_share` of
+    half the scene's size about each axis (standard deviations, drawn by seed and view) are put onto the poses given; at
+    the exposure's ends as much again, halved, in opposite directions.
+
     TfS: `tfs_weight` in the reading `weight_reading` of Eq. TfS (`effective_weight` maps it); textures at
     `textures_per_view` instants, of kind `textures` (`both` = TFP and TFI, averaged to one residual by `tfs_combine`
     average, or two losses by sum; `tfi-window` = TFI over as many intervals as fit into `texture_window` ticks, the
     least noisy; `raw` = the spike bit itself). `tfs_domain`: encoded = sRGB of texture against sRGB
     of the gray of the linearised render; linear = both linear; luma = gray of the encoded render against the encoded
     texture; naive = gray of the encoded render against the linear texture (wrong, for the ablation). `highlights`:
-    clip textures to display white, where RGB ends too, or keep them. `tfs_from`: fraction of the run where TfS begins.
+    clip textures to display white, where RGB ends too, or keep them. `gray`: how RGB becomes what a spike sees:
+    calibrated before training and frozen; rec601; learned (the paper's, free); constrained (learned, positive weights
+    of fixed sum); response (constrained, then a learned monotone curve). Learned ones start from Rec.601.
+    `tfs_from`: fraction of the run where TfS begins.
 
     Exposure (train/exposure.py): frames of different gain or white balance, as real captures have them. affine: a
     colour matrix and offset a view, in linear light; bilateral: a grid of them a view, smoothed by `exposure_tv`.
@@ -147,6 +165,16 @@ class FitConfig:
     instants_rule: str = "midpoints"
     exposure: str = "off"
     exposure_tv: float = 10.0
+    # paths
+    trajectory: str = "given"
+    knots: int = 0
+    knots_at: str = "even"
+    path_from: str = "given"
+    anchor: str = "mean"
+    lr_poses: float = 1e-3
+    lr_poses_end: float = 0.01
+    pose_noise_deg: float = 0.0
+    pose_noise_share: float = 0.0
     # TfS
     tfs_weight: float = 0.0
     tfs_from: float = 0.0
@@ -208,6 +236,7 @@ class FitConfig:
                 self.exposure == "bilateral" and self.field != "splat",
                 "a bilateral grid needs whole pictures (field splat): exposure affine corrects rays too",
             ),
+            *self._path_faults(),
             (self.pose_label == "first" and self.colour_target == "truth", "the truth is not labelled by pose_label"),
         ]
 
@@ -237,6 +266,24 @@ class FitConfig:
             (not 4 <= self.occupancy <= 512, "occupancy must be 4 to 512"),
         ]
 
+    def _path_faults(self) -> list[tuple[bool, str]]:
+        least = 4 if self.trajectory == "cubic" else 2
+        still = self.trajectory == "given" and (self.path_from == "mid" or self.knots != 0 or self.knots_at != "even")
+        return [
+            (self.knots != 0 and not least <= self.knots <= 64, f"knots must be 0 or {least} to 64"),
+            (self.knots != 0 and self.knots_at == "spikes", "the spikes say how many knots there are: knots must be 0"),
+            (self.moves_cameras and self.colour_target == "truth", "the truth is seen from its true poses, which hold"),
+            (still, "knots, knots_at and path_from belong to trajectory=linear or cubic"),
+            (not 0 < self.lr_poses_end <= 1, "lr_poses_end must be in (0, 1]"),
+            (not 0 <= self.pose_noise_deg <= 90, "pose_noise_deg must be 0 to 90"),
+            (not 0 <= self.pose_noise_share <= 1, "pose_noise_share must be 0 to 1"),
+        ]
+
+    @property
+    def moves_cameras(self) -> bool:
+        """Whether training cameras are not those of the scene."""
+        return self.trajectory != "given" or self.pose_noise_deg > 0 or self.pose_noise_share > 0
+
     @property
     def needs_spikes(self) -> bool:
         """Whether any term reads spikes."""
@@ -244,7 +291,9 @@ class FitConfig:
 
     @property
     def needs_trajectory(self) -> bool:
-        """Whether any instant but mid-exposure is rendered."""
+        """Whether any instant but mid-exposure is rendered, from a pose that must be given."""
+        if self.trajectory != "given":
+            return False
         many = self.poses_per_view > 1 and self.ratio_until < 1
         textures = self.tfs_weight > 0 and self.textures_per_view > 1
         ratio = self.ratio_until > 0 and self.ratio_instants > 1

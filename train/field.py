@@ -59,6 +59,7 @@ class Model(Protocol):
 class Step:
     """What a field may need to know of a step: fraction of the run done, background, the step's random draws.
 
+    Every draw appends what it cost to `drawn`: 1 a picture, or the number of rays.
     `notes`: what was seen on the way, by name: loss terms ("colour", "tfs", "parts") and what the field itself keeps.
     """
 
@@ -66,6 +67,7 @@ class Step:
     fraction: float
     background: tuple[float, float, float]
     rng: np.random.Generator
+    drawn: list[int] = field(default_factory=list)
     notes: dict[str, list[Any]] = field(default_factory=dict)
 
     def note(self, name: str, what: Any) -> None:

@@ -56,6 +56,10 @@ def parts_of(config: FitConfig) -> tuple[Part, ...]:
         from spikerig.train.exposure import AFFINE, BILATERAL
 
         found.append(AFFINE if config.exposure == "affine" else BILATERAL)
+    if config.trajectory != "given":
+        from spikerig.train.path import PART as PATH
+
+        found.append(PATH)
     return tuple(found)
 
 

@@ -141,6 +141,7 @@ class RayField:
         """The pixels from their poses, by every network: pictures of B rows and one column."""
         if view.pixels is None:
             raise ValueError("a batch of pixels, as look() makes it")
+        step.drawn.append(len(view.pixels))
         rays = rays_of(model.camera, pose, view.pixels)
         return [seen.colour[:, None].contiguous() for seen in model.trace(rays, step.background, step.rng)]
 

@@ -69,6 +69,7 @@ class SplatField:
     def draw(self, model: SplatModel, view: TrainView, pose: Tensor, step: Step) -> list[Tensor]:
         """One picture."""
         config = model.config
+        step.drawn.append(1)
         rows = config.sh_degree + 1
         degree = min(config.sh_degree, int(step.fraction / max(config.sh_warmup, 1e-9) * rows))
         drawn = model.draw(pose, step.background, degree)
