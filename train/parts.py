@@ -51,7 +51,7 @@ class Part:
 
 def parts_of(config: FitConfig) -> tuple[Part, ...]:
     """The parts that a config asks for, in the order in which they act."""
-    found: list[Part] = []
+    found: list[Any] = []
     if config.exposure != "off":
         from spikerig.train.exposure import AFFINE, BILATERAL
 
