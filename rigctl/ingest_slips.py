@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from spikerig.dataset.errors import DataError
 from spikerig.dataset.framing import FEWEST, find_phase, rates_at, seam_scores
-from spikerig.dataset.rawtake import RawTake, WireBytes, read_lines
+from spikerig.dataset.rawtake import RawTake, TakenView, WireBytes, read_lines
 
 LOOK_TICKS, EVERY_TICKS = 32, 128  # of a look, and between two
 SEAM_TICKS = 256  # of a stretch whose edges are looked at
@@ -200,6 +200,14 @@ class MendedBytes(WireBytes):
         end, bytes_ = self._doubtful.get(epoch, (0, 0))
         first, last = max(start, self.sent(epoch, end) - bytes_), min(stop, self.sent(epoch, end))
         return found + ([(first, last)] if first < last else [])
+
+
+def mended(take: RawTake, views: Sequence[TakenView]) -> tuple[MendedBytes, list[TakenView]]:
+    """A take's bytes with small losses put back, and its viewpoints with spans in bytes as the camera sent them."""
+    wire = MendedBytes(take, [s for v in views for s in v.spikes])
+    return wire, [
+        replace(v, spikes=tuple((e, wire.sent(e, a), wire.sent(e, b)) for e, a, b in v.spikes)) for v in views
+    ]
 
 
 def _doubtful_ends(take: RawTake) -> dict[int, tuple[int, int]]:

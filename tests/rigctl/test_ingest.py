@@ -18,7 +18,7 @@ from spikerig.dataset.rawtake import WireBytes, open_take, read_lines, verify_ta
 from spikerig.dataset.segments import Chunk, scan
 from spikerig.dataset.store import open_scene, verify_scene
 from spikerig.rigctl.ingest import IngestConfig, ingest
-from spikerig.rigctl.ingest_sights import panel_pairs, sights
+from spikerig.rigctl.ingest_sights import panel_in_view, panel_pairs, sights
 from spikerig.rigctl.ingest_slips import MendedBytes, find_slips
 from spikerig.rigctl.ingest_times import Framing, Times, clip_number, read_truth
 from spikerig.rigctl.ingest_truth import TrueWorld
@@ -264,7 +264,9 @@ def test_frames_of_a_long_shutter_are_timed_as_well_as_is_claimed(tmp_path: Path
     wire = WireBytes(raw)
     times = Times(raw, truth)
     framing = Framing(wire, [s for v in raw.views() for s in v.spikes], panel_pairs(raw))
-    times.fit(sights(raw, raw.views(), times.clocks, wire, framing)[0])
+    panel = panel_in_view(raw.plan)
+    assert panel is not None
+    times.fit(sights(raw, raw.views(), panel, times.marks, wire, framing)[0])
     off, claimed = [], []
     for clip in (r for r in truth[0]["rgb"] if r["event"] == "clip"):
         media, true = np.array(clip["media_ns"]), np.array(clip["true_ns"])
