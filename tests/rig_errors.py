@@ -152,7 +152,8 @@ BOX = [
     row("the 1 Hz sync packet: roll-over, cut", "the box's time to 1 ns; cut at the wrong byte: refused", "clock jack",
         _F + "test_the_sync_packet_of_each_second_tells_the_boxs_time"),
     row("no panel in view, panel misread", "nothing is guessed: refused; codes off by steps are left out",
-        "both cameras", "rigctl/test_panel_take.py::test_a_take_without_a_panel_is_told", _N + "test_marks_that_went_wrong"),
+        "both cameras", "rigctl/test_panel_take.py::test_a_take_without_a_panel_is_told",
+        _N + "test_marks_that_went_wrong"),
 ]  # fmt: skip
 
 CLOCK = [
