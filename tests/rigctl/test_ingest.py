@@ -19,10 +19,11 @@ from spikerig.dataset.segments import Chunk, scan
 from spikerig.dataset.store import open_scene, verify_scene
 from spikerig.rigctl.ingest import IngestConfig, ingest
 from spikerig.rigctl.ingest_sights import panel_pairs, sights
-from spikerig.rigctl.ingest_slips import MendedBytes, find_slips
+from spikerig.rigctl.ingest_slips import MendedBytes
 from spikerig.rigctl.ingest_times import Framing, Times, clip_number, read_truth
 from spikerig.rigctl.ingest_truth import TrueWorld
 from spikerig.rigctl.profiles import PROFILES
+from spikerig.rigctl.slips import find_slips
 
 
 @pytest.fixture(scope="module")
@@ -288,7 +289,7 @@ def test_a_loss_of_whole_rows_is_told_where_the_picture_has_edges(kind: str, los
     def read(epoch: int, start: int, stop: int) -> tuple[np.ndarray, list[tuple[int, int]]]:
         return came[start:stop], [] if stop <= len(came) else [(len(came), stop)]
 
-    wire = SimpleNamespace(take=SimpleNamespace(profile=profile), read=read)
+    wire = SimpleNamespace(profile=profile, read=read)
     found = find_slips(wire, [(0, 0, len(came))])  # type: ignore[arg-type]
     assert [s.lost for s in found] == [lost] * sure
     assert all(s.after <= cut <= s.before for s in found)
