@@ -101,8 +101,9 @@ class SlipWatch:
         looks again every 6.4 ms in between, and only where two such looks differ, too, comes the test that ingest
         makes (`slips.narrow`, `slips.settled`): the shift must come at once, within 3 ms, and one of whole rows only
         where the picture's edges moved as well. So a moving picture is no loss, and what is told here is what ingest
-        would find. Those tests are rationed (one in 16 looks, 4 in a row), or a rig that is carried about would cost a
-        whole core; what was not tested is counted, and ingest finds it. After a slip nothing is told until the next
+        would find. Those tests are rationed (one in 16 looks, 4 in a row; shifts by whole rows, as a picture that moves
+        makes them, and others apart), or a rig that is carried about would cost a whole core; what was not tested is
+        counted, and ingest finds it. After a slip nothing is told until the next
         epoch. Whole ticks that are lost move nothing.
 
     Cost:
@@ -118,7 +119,7 @@ class SlipWatch:
         self._window = _Window(profile)
         self._seen: tuple[int, Rates] | None = None  # the last look: where, and what
         self._before: Bytes | None = None  # the last look of the epoch before
-        self._tests = TESTS
+        self._tests = [TESTS, TESTS]  # at hand: of shifts by whole rows, as of a moving picture, and of all others
 
     def add(self, epoch: int, byte_index: int, data: Bytes) -> Slip | Refound | None:
         """Bytes of an epoch, in order; where some are left out, what lies between is not judged."""
@@ -165,28 +166,31 @@ class SlipWatch:
         (before, then), now = self._seen, byte_counts(self._at(at), self._size)
         self._seen = (at, now)
         self.looks += 1
-        self._tests = min(TESTS, self._tests + EARNED)
-        if not self._shifted(then, now):
+        self._tests = [min(TESTS, left + EARNED) for left in self._tests]
+        if not self._shift(then, now):
             return None
         self.suspicions += 1
         last, counts = before, then
         for near in [*range(before + STEP * self._size, at, STEP * self._size), at]:
             here = now if near == at else byte_counts(self._at(near), self._size)
-            if self._shifted(counts, here) and (slip := self._test(last, near)):
+            shift = self._shift(counts, here)
+            if shift and (slip := self._test(last, near, shift)):
                 return slip
             last, counts = near, here
         return None
 
-    def _shifted(self, then: Rates, now: Rates) -> bool:
+    def _shift(self, then: Rates, now: Rates) -> int:
         phase = find_shift(now, then, self.profile)
-        return phase.offset != 0 and phase.confidence > SURE
+        return phase.offset if phase.confidence > SURE else 0
 
-    def _test(self, before: int, at: int) -> Slip | None:
+    def _test(self, before: int, at: int, shift: int) -> Slip | None:
         """The test that ingest makes, where there is one at hand."""
-        if self._tests < 1:
+        row = self.profile.row_bits // 8
+        kind = int(1 < shift % row < row - 1)
+        if self._tests[kind] < 1:
             self.untested += 1
             return None
-        self._tests -= 1
+        self._tests[kind] -= 1
         slip = narrow(self._window, self._epoch, before, at)
         span = (self._epoch, self._window.first, self._window.end)
         sure = None if slip is None else settled(self._window, slip[0], [span], slip[1])

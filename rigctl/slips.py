@@ -104,9 +104,13 @@ def narrow(wire: Stream, epoch: int, first: int, second: int) -> tuple[Missing, 
     """The loss between two looks and its shift, by halves; None where the shift comes bit by bit: a moving picture."""
     size = wire.profile.tick_bytes
     room = LOOK_TICKS * size
+    whole = shift_between(wire, epoch, first, second)
     while second - first > room:
         mid = first + (second - first) // (2 * size) * size
-        first, second = (first, mid) if shift_between(wire, epoch, first, mid) else (mid, second)
+        # a picture that moves shifts in both halves, the loss in one: that one is more like the whole
+        off = [abs((shift_between(wire, epoch, *half) - whole + size // 2) % size - size // 2)
+               for half in ((first, mid), (mid, second))]  # fmt: skip
+        first, second = (first, mid) if off[0] <= off[1] else (mid, second)
     # a look in the loss itself sees both framings: the ones on either side of it see one each
     first, second = first - room // 2 // size * size, second + room // 2 // size * size
     shift = shift_between(wire, epoch, max(first, 0), second)

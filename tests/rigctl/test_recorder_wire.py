@@ -26,7 +26,7 @@ from spikerig.rigctl.segment_writer import SegmentWriter
 from spikerig.rigctl.vidar import VidarSource
 
 S = 1000 * MS
-QUIET = ("direct-io", "set-aside", "ring")  # "ring": emulated time runs faster than this disk
+QUIET = ("direct-io", "set-aside", "framing", "ring")  # "ring": emulated time runs faster than this disk
 
 
 @dataclass
