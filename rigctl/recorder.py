@@ -247,7 +247,9 @@ class Recorder:
         """Bytes that are not kept go to the watch all the same, as long as the disk has little to do."""
         while self.options.watch and len(data):
             if self._idle is None:
-                if self.ring.fill > 1 or (slot := self.ring.take()) is None:
+                wait = self.options.on_full == "wait"
+                slot = self.ring.take(wait) if wait or self.ring.fill <= 1 else None
+                if slot is None:
                     return
                 slot.wanted, slot.epoch, slot.byte_index, self._idle = False, self._epoch, at, slot
             slot = self._idle
