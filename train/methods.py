@@ -61,6 +61,14 @@ def average(config: FitConfig) -> FitConfig:
     return replace(config, method="average", poses_per_view=5, fresh_poses=1)
 
 
+def bad(config: FitConfig) -> FitConfig:
+    """BAD-NeRF and BAD-Gaussians: blurry RGB explained by a linear path of 10 sub-poses found from the mid pose alone.
+
+    Source: Wang et al. 2023, Zhao et al. 2024: L1 + 0.2 D-SSIM for splats, L2 for rays; rate 1e-3 to 1e-5.
+    """
+    return replace(config, method="bad", poses_per_view=10, trajectory="linear", path_from="mid")
+
+
 def spikenerf(config: FitConfig) -> FitConfig:
     """The paper's TfS loss, 1x: one pose, one texture; L2 colour, as an L1 would keep pulling to the blur."""
     return replace(config, method="spikenerf", colour_loss="l2", tfs_weight=20.0)
@@ -100,6 +108,7 @@ def oracle(config: FitConfig) -> FitConfig:
 METHODS: dict[str, Callable[[FitConfig], FitConfig]] = {
     "plain": plain,
     "average": average,
+    "bad": bad,
     "spikenerf": spikenerf,
     "spikenerf-5x": spikenerf_5x,
     "spike-ratio": spike_ratio,

@@ -27,6 +27,7 @@ class Part:
 
     Args:
         name: its parameters are called `name:...` in State.params and checkpoints.
+        remark: told with every fit and kept in run.json.
         instants: config -> fractions of the exposure that are rendered beside those of colour and textures.
         read: (scene, view, config) -> pictures [H,W,...] by name, kept as TrainView.beside (of a batch of pixels, the
             values there).
@@ -38,6 +39,7 @@ class Part:
     """
 
     name: str
+    remark: str = ""
     instants: Callable[[FitConfig], tuple[float, ...]] | None = None
     read: Callable[[SceneFile, View, FitConfig], dict[str, Tensor]] | None = None
     start: Callable[[Any], Tensors] | None = None
@@ -49,7 +51,16 @@ class Part:
 
 def parts_of(config: FitConfig) -> tuple[Part, ...]:
     """The parts that a config asks for, in the order in which they act."""
-    return ()
+    found: list[Part] = []
+    if config.exposure != "off":
+        from spikerig.train.exposure import AFFINE, BILATERAL
+
+        found.append(AFFINE if config.exposure == "affine" else BILATERAL)
+    if config.trajectory != "given":
+        from spikerig.train.path import PART as PATH
+
+        found.append(PATH)
+    return tuple(found)
 
 
 def part_of(config: FitConfig, parameter: str) -> tuple[Part, str] | None:

@@ -153,6 +153,9 @@ class RayField:
         """Nothing."""
         return []
 
+    def sense(self, config: FitConfig, step: Step) -> None:
+        """Nothing."""
+
     def tend(self, state: State, config: FitConfig, step: Step) -> None:
         """The occupancy grid follows the density."""
         if self.name == "nerf-fast":

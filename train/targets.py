@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from spikerig.calib.straight import Straight, straight_of
 from spikerig.dataset.bayer import bayer_of
 from spikerig.dataset.clocktime import ClockModel
-from spikerig.dataset.errors import DataError, UsageError
+from spikerig.dataset.errors import DataError, NumericsError, UsageError
 from spikerig.dataset.scene import Floats, View
 from spikerig.dataset.spikes import SpikeStream
 from spikerig.dataset.terminal import Progress
@@ -22,7 +22,7 @@ from spikerig.train.gauge import Gauge
 from spikerig.train.gray import Gray, Pairs, solve
 from spikerig.train.losses import mean_weights, ratio_target, srgb_from_linear
 from spikerig.train.parts import parts_of
-from spikerig.train.trajectory import phases, pose_at, sub_pose
+from spikerig.train.trajectory import PATH_PHASES, given_pose, phases, pose_at
 
 if TYPE_CHECKING:
     from spikerig.dataset.store import SceneFile
@@ -67,7 +67,8 @@ class TrainView:
 class Targets:
     """All training views, the instants each term uses (fractions of the exposure), the converter, remarks.
 
-    `also`: further instants that parts ask for.
+    `also`: further instants that parts ask for. `given`: where cameras move, the poses [N,5,3,4] of the world that the
+    fit was given at PATH_PHASES.
     """
 
     views: tuple[TrainView, ...]
@@ -77,6 +78,7 @@ class Targets:
     gray: Gray | None
     remarks: tuple[str, ...] = field(default=())
     also: tuple[float, ...] = field(default=())
+    given: Floats = field(default_factory=lambda: np.zeros((0, len(PATH_PHASES), 3, 4)))
 
 
 def views_of_step(targets: Targets, seed: int, step: int, count: int = 1) -> list[TrainView]:
@@ -190,8 +192,9 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
         gauge: poses are given in it.
 
     Raises:
-        DataError: no training views, no spikes, no trajectory or no truth where the method needs it; a colour spike
-            camera.
+        DataError: no training views, nothing valid in them, no spikes, no trajectory or no truth where the method
+            needs it; a colour spike camera.
+        NumericsError: true light that is not finite.
         UsageError: single spikes are asked for, and the spike arm's lens bends.
     Cost: a texture takes milliseconds; memory 12 bytes a pixel and view, +4 a texture, +6 a ratio instant.
     """
@@ -221,12 +224,21 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
     parts = parts_of(config)
     also = tuple(dict.fromkeys(p for part in parts if part.instants is not None for p in part.instants(config)))
     pairs, raw, bar = Pairs(), [], Progress("preparing views", len(scene.train), "views")
-    for name in scene.train:
-        raw.append(_read(scene, name, config, (colour, tfs, ratio, also), pairs, straight))
+    for number, name in enumerate(scene.train):
+        raw.append(_read(scene, name, number, config, gauge, (colour, tfs, ratio, also), pairs, straight))
         bar.step()
+    if not any(each["valid"].any() for each in raw):
+        raise DataError(
+            "no pixel of any training view is valid",
+            value=scene.name,
+            expected="views whose two arms see something in common",
+            cause="an alignment that missed, or masks that are inverted",
+            next="spikerig data check FILE",
+        )
     gray = solve(pairs, config.gray, scene.light_gain) if config.needs_spikes else None
     views = tuple(_finish(each, k, config, gauge, gray, (colour, tfs, ratio)) for k, each in enumerate(raw))
-    return Targets(views, colour, tfs, ratio, gray, _remarks(raw), also)
+    given = [each["given"] for each in raw] if config.moves_cameras else np.zeros((0, len(PATH_PHASES), 3, 4))
+    return Targets(views, colour, tfs, ratio, gray, _remarks(raw), also, np.array(given))
 
 
 def _remarks(raw: list[dict[str, Any]]) -> tuple[str, ...]:
@@ -242,7 +254,9 @@ def _remarks(raw: list[dict[str, Any]]) -> tuple[str, ...]:
 def _read(
     scene: SceneFile,
     name: str,
+    number: int,
     config: FitConfig,
+    gauge: Gauge,
     instants: tuple[tuple[float, ...], ...],
     pairs: Pairs,
     straight: Straight,
@@ -260,13 +274,18 @@ def _read(
         "light": light,
         "valid": np.array(view.valid),
         "row_ns": view.frame.row_ns,
-        "pose": {phase: sub_pose(view, phase) for phase in dict.fromkeys((*colour, *tfs, *ratio, *also))},
+        "pose": {
+            phase: given_pose(view, number, phase, config, gauge.scale)
+            for phase in dict.fromkeys((*colour, *tfs, *ratio, *also))
+        },
         "beside": {n: t for part in parts_of(config) if part.read for n, t in part.read(scene, view, config).items()},
         "textures": {},
     }
     if config.colour_target == "truth":
-        made["light"] = np.array(scene.truth_light(name), np.float32)
+        made["light"] = _finite(np.array(scene.truth_light(name), np.float32), name, scene)
         made["pose"] = dict.fromkeys(made["pose"], truth_pose(scene, view))
+    if config.moves_cameras:
+        made["given"] = [given_pose(view, number, phase, config, gauge.scale) for phase in PATH_PHASES]
     if config.needs_spikes:
         clock = scene.clock
         mean = straight.texture(exposure_mean(view, clock))
@@ -277,6 +296,20 @@ def _read(
             found = textures_at(view.spikes, tick, config.textures, config.texture_window)
             made["textures"][phase] = [straight.texture(t) for t in found]
     return made
+
+
+def _finite(light: NDArray[np.float32], name: str, scene: SceneFile) -> NDArray[np.float32]:
+    """True light as it is, if all of it is finite (a file that was changed since it was written may hold anything)."""
+    bad = np.argwhere(~np.isfinite(light))
+    if len(bad):
+        raise NumericsError(
+            f"the true light of view '{name}' is not finite",
+            value=f"{light[tuple(bad[0])]} at index {bad[0].tolist()}, {len(bad)} in all",
+            expected="finite numbers",
+            cause="a damaged file",
+            next=f"spikerig data verify {scene.path}",
+        )
+    return light
 
 
 def _finish(
