@@ -146,7 +146,7 @@ def _equal_dB(doc: Doc) -> list[str]:
                 lines.append(f"| `{name}` | no curve | | |")
                 continue
             count = f"{cpu['reached_cells']} of {cpu['cells']}"
-            lines.append(f"| `{name}` | {_spent(cpu, '.1f')} | {_spent(costs['renders'], '.6g')} | {count} |")
+            lines.append(f"| `{name}` | {_spent(cpu, '.1f')} | {_spent(costs['renders'], '.0f')} | {count} |")
         lines.append("")
     return lines
 
