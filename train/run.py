@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from spikerig.dataset.store import SceneFile
 
 MOST_EXAMS = 8  # held-out views looked at for the curve
+LOOKS = (1 / 80, 1 / 40, 1 / 20, *(k / 10 for k in range(1, 10)))  # fractions of a run, closer where dB rise fast
 
 
 def run_fit(
@@ -56,7 +57,7 @@ def run_fit(
         out: folder of the run.
         resume: go on from its checkpoint, where there is one; the config must be the same.
         force: replace an earlier run.
-        eval_every: seconds of training between held-out scores; None = a tenth of the run, 0 = only at the end.
+        eval_every: seconds of training between held-out scores; None = at LOOKS, 0 = only at the end.
         checkpoint_every: seconds between checkpoints.
         ply: write splats.ply at the end.
         score_on: scene whose held-out views make the curve; None: those of the scene itself.
@@ -241,7 +242,7 @@ class _Watch:
 
     def _due(self, state: State, fraction: float) -> bool:
         if self.eval_every is None:
-            return int(fraction * 10) > int(self.looked * 10)
+            return any(self.looked < at <= fraction for at in LOOKS)
         last = state.history[-1]["seconds"] if state.history else 0.0
         return self.eval_every > 0 and state.seconds - last >= self.eval_every
 
