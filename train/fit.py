@@ -164,7 +164,7 @@ def one_step(state: State, task: Task, fraction: float) -> float:
     if not np.isfinite(value):
         raise _not_finite(state, f"the loss of view '{view.name}' is {value}")
     if loss.requires_grad:
-        field.sense(config, step)
+        task.field.sense(task.config, step)
         loss.backward()
     _descend(state, task, fraction)
     if state.step % CHECK_EVERY == 0:
