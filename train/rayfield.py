@@ -99,14 +99,19 @@ class RayField:
     name: str
 
     def start(self, points: Points | None, gauge: Gauge, config: FitConfig) -> tuple[Tensors, Tensors]:
-        """Random networks; points are not used (the gauge has seen them)."""
+        """Random networks; those of nerf-fast are then taught the points, unless `init` is random or there are none."""
         if self.name == "nerf":
             from spikerig.train.vanilla import start_vanilla
 
             return start_vanilla(config)
         from spikerig.train.hashed import start_hashed
 
-        return start_hashed(config)
+        params, grids = start_hashed(config)
+        if config.init == "points" and points is not None and len(points.xyz):
+            from spikerig.train.prime import prime
+
+            prime(params, grids, gauge.inside(points.xyz), points.rgb / 255.0, config)
+        return params, grids
 
     def model(self, params: Tensors, grids: Tensors, gauge: Gauge, camera: Camera, config: FitConfig) -> RayModel:
         """Something to trace rays with."""
