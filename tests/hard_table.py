@@ -1,4 +1,3 @@
-# ruff: noqa: E501
 """Hard cases of tables: kills, failures, foreign folders, costs that are never reached."""
 
 TABLE, CLAIMS = "train/test_table.py::test_", "train/test_claims.py::test_"

@@ -36,13 +36,13 @@ CHOICES: dict[str, tuple[str, ...]] = {
 }
 PAPER_BATCH = 1024
 SPLAT_ONLY = {
-    "splats", "init", "init_opacity", "init_scale", "antialias", "densify", "densify_every", "densify_until", "noise",
+    "splats", "init_opacity", "init_scale", "antialias", "densify", "densify_every", "densify_until", "noise",
     "densify_from", "densify_by", "densify_grad", "densify_size", "densify_share", "splats_most", "huge", "absgrad",
     "opacity_reset",
     "opacity_reg", "scale_reg", "sh_warmup", "ssim_weight", "fresh_poses", "lr_means", "lr_scales", "lr_quats",
     "lr_opacities", "lr_colours",
 }  # fmt: skip
-FAST_ONLY = {"grid_levels", "coarsest", "finest", "table_log2", "occupancy", "lr_grid"}
+FAST_ONLY = {"grid_levels", "coarsest", "finest", "table_log2", "occupancy", "probes", "lr_grid"}
 RAYS_ONLY = {"rays", "views_per_step", "coarse", "fine", "width", "lr_net", *FAST_ONLY}
 
 
@@ -64,8 +64,10 @@ class FitConfig:
 
     Rays (fields nerf and nerf-fast): a step draws `rays` pixels, from `views_per_step` views in equal shares. `coarse`
     and `fine` are samples a ray: of the two networks of nerf; for nerf-fast the places looked up in the occupancy grid,
-    and those the network sees. `width` is that of the hidden layers; `grid_levels` levels of a hash grid go from
-    `coarsest` to `finest` cells along an axis with at most 2^`table_log2` rows each; `occupancy` cells along an axis.
+    and those the networks are trained at; with `probes` > 0 the density of so many places, looked up without gradient,
+    says where those are. nerf-fast starts from the scene's points, or with `init` random from nothing. `width` is that
+    of the hidden layers; `grid_levels` levels of a hash grid go from `coarsest` to `finest` cells along an axis with at
+    most 2^`table_log2` rows each; `occupancy` cells along an axis.
 
     Camera: a blurry frame is explained by `poses_per_view` sub-poses of its exposure, averaged in linear light. One
     sub-pose is the instant of `pose_label` (the paper does not say which). More lie at (j+1/2)/n of the exposure
@@ -144,6 +146,7 @@ class FitConfig:
     finest: int = 512
     table_log2: int = 16
     occupancy: int = 64
+    probes: int = 32
     # rates
     lr_means: float = 4e-4
     lr_scales: float = 3e-2
@@ -263,6 +266,7 @@ class FitConfig:
             (self.views_per_step > self.rays, "views_per_step must not exceed rays"),
             (max(self.coarse, self.fine, self.width) > 4096, "coarse, fine and width are at most 4096"),
             (self.rays > 1 << 20, "rays is at most 2^20"),
+            (not 0 <= self.probes <= 4096, "probes must be 0 to 4096"),
             (not 4 <= self.occupancy <= 512, "occupancy must be 4 to 512"),
         ]
 
@@ -278,6 +282,11 @@ class FitConfig:
             (not 0 <= self.pose_noise_deg <= 90, "pose_noise_deg must be 0 to 90"),
             (not 0 <= self.pose_noise_share <= 1, "pose_noise_share must be 0 to 1"),
         ]
+
+    @property
+    def spoils_cameras(self) -> bool:
+        """Whether the given cameras are made worse, for a study."""
+        return self.pose_noise_deg > 0 or self.pose_noise_share > 0
 
     @property
     def moves_cameras(self) -> bool:

@@ -132,7 +132,7 @@ def configure(method: str = "plain", preset: str = "standard", field: str = "spl
     known = {f.name for f in fields(FitConfig)}
     if strange := sorted(set(changes) - known):
         raise UsageError("no such setting", value=", ".join(strange), expected=", ".join(sorted(known)))
-    other = {"splat": RAYS_ONLY, "nerf": SPLAT_ONLY | FAST_ONLY | {"sh_degree"}, "nerf-fast": SPLAT_ONLY}[field]
+    other = {"splat": RAYS_ONLY, "nerf": SPLAT_ONLY | FAST_ONLY | {"sh_degree", "init"}, "nerf-fast": SPLAT_ONLY}[field]
     if strange := sorted(set(changes) & other):
         raise UsageError(
             f"field {field} has no use for these settings", value=", ".join(strange), next="leave them out"

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,21 +12,20 @@ from numpy.typing import NDArray
 
 from spikerig.calib.straight import Straight, straight_of
 from spikerig.dataset.bayer import bayer_of
-from spikerig.dataset.clocktime import ClockModel
 from spikerig.dataset.errors import DataError, NumericsError, UsageError
 from spikerig.dataset.scene import Floats, View
-from spikerig.dataset.spikes import SpikeStream
 from spikerig.dataset.terminal import Progress
+from spikerig.train import rolling
 from spikerig.train.config import FitConfig
 from spikerig.train.gauge import Gauge
 from spikerig.train.gray import Gray, Pairs, solve
 from spikerig.train.losses import mean_weights, ratio_target, srgb_from_linear
 from spikerig.train.parts import parts_of
+from spikerig.train.spikelight import average_texture, exposures, light_at, textures_at
 from spikerig.train.trajectory import PATH_PHASES, given_pose, phases, pose_at
 
 if TYPE_CHECKING:
     from spikerig.dataset.store import SceneFile
-    from spikerig.dataset.texture import Texture
 
 NEEDS_TRUTH = "a simulated scene (spikerig sim capture); real scenes have no sharp truth"
 
@@ -52,6 +51,9 @@ class TrainView:
 
     Or B pixels of some views, as pictures of B rows and one column: then `pixels` int64[B] says which (row * width +
     column), `which` is int64[B], and an instant's pose is [B,3,4].
+
+    `late` (rolling shutter, fields of rays): how many exposures after the middle row a pixel was exposed, float32[H,W];
+    an instant's pose is then [K,3,4], of the first pixel read to the last. Of a batch: [B,1].
     """
 
     name: str
@@ -61,6 +63,7 @@ class TrainView:
     pixels: torch.Tensor | None = None
     which: torch.Tensor = field(default_factory=lambda: torch.zeros(1, dtype=torch.int64))
     beside: dict[str, torch.Tensor] = field(default_factory=dict)
+    late: torch.Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,16 +92,6 @@ def views_of_step(targets: Targets, seed: int, step: int, count: int = 1) -> lis
     return [targets.views[orders[k // n][k % n]] for k in turns]
 
 
-def spikes_of(view: View) -> SpikeStream:
-    """The spikes of a view that must have them."""
-    if view.spikes is None:
-        raise DataError(
-            f"view '{view.name}' has no spikes, and this method trains on them",
-            next="--method plain or average needs none",
-        )
-    return view.spikes
-
-
 def truth_pose(scene: SceneFile, view: View) -> Floats:
     """The camera [3,4] at the instant of a view's sharp truth; its mid-exposure pose where no instant is given."""
     if view.trajectory is None or len(view.trajectory.at_ns) < 2:
@@ -107,80 +100,6 @@ def truth_pose(scene: SceneFile, view: View) -> Floats:
         return pose_at(view.trajectory, float(scene.truth_at_ns(view.name)))
     except UsageError:  # no instant given
         return view.pose.cam_from_world
-
-
-def spike_tick(view: View, at_ns: float, clock: ClockModel | None) -> float:
-    """The (fractional) tick of a view's spikes at an instant of its frame's clock.
-
-    Raises:
-        DataError: the spikes are on another clock and the scene has no map to it.
-    """
-    stream = spikes_of(view)
-    if stream.clock == view.frame.clock:
-        return stream.tick_at(round(at_ns))
-    if clock is None:
-        raise DataError(
-            f"the frame and spikes of view '{view.name}' are on different clocks",
-            value=f"{view.frame.clock} and {stream.clock}",
-            expected="one clock, or the scene's map between them",
-        )
-    return stream.tick_at(int(clock.device_from_rig(np.int64(round(at_ns)))))
-
-
-def windowed_tfi(stream: SpikeStream, tick: float, window: int) -> Texture:
-    """TFI over the most intervals (1, 3 or 9: as many before as after) that fit into a window of ticks.
-
-    One interval where even three are longer. Bright pixels get the low noise of a window, dark ones no zero counts:
-    on the demo scene its error is half that of TFP over 32 ticks.
-    """
-    from spikerig.dataset.texture import Texture, tfi
-
-    first = tfi(stream, tick)
-    light, known = first.light.copy(), first.known
-    for k in (3, 9):
-        longer = tfi(stream, tick, intervals=k)
-        fits = longer.known & (k <= window * longer.light)
-        light[fits] = longer.light[fits]
-    return Texture(light, known, tick, f"tfi-window-{window}")
-
-
-def textures_at(stream: Any, tick: float, kind: str, window: int) -> list[Texture]:
-    """The textures of an instant by kind: tfp, tfi, both of them, tfi-window, or raw (the one tick's spikes)."""
-    from spikerig.dataset.texture import tfi, tfp
-
-    made: dict[str, Callable[[], list[Texture]]] = {
-        "tfp": lambda: [tfp(stream, tick, window)],
-        "tfi": lambda: [tfi(stream, tick)],
-        "both": lambda: [tfp(stream, tick, window), tfi(stream, tick)],
-        "tfi-window": lambda: [windowed_tfi(stream, tick, window)],
-        "raw": lambda: [tfp(stream, tick, 1)],
-    }
-    return made[kind]()
-
-
-def average_texture(found: list[Texture]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Mean over the textures known at each pixel: (light [H,W], known where any is)."""
-    known = np.stack([t.known for t in found])
-    light = np.where(known, np.stack([t.light for t in found]), 0).sum(0)
-    return (light / np.maximum(known.sum(0), 1)).astype(np.float32), np.asarray(known.any(0), np.bool_)
-
-
-def exposure_mean(view: View, clock: ClockModel | None) -> Texture:
-    """Spikes a tick over the whole exposure, of the raw spikes."""
-    from spikerig.dataset.texture import Texture, window_sum
-
-    stream = spikes_of(view)
-    t0, t1 = (round(spike_tick(view, view.instant_ns(phase), clock)) for phase in (0.0, 1.0))
-    if not (0 <= t0 < t1 <= stream.ticks):
-        raise DataError(
-            f"the spikes of view '{view.name}' do not cover its exposure",
-            value=f"exposure ticks {t0}..{t1}, stream 0..{stream.ticks}",
-            expected="spikes from before its start to after its end",
-            next="spikerig data verify FILE",
-        )
-    lost = any(a < t1 and b > t0 for a, b in stream.lost)
-    light = np.asarray(window_sum(stream, t0, t1), np.float32) / np.float32(t1 - t0)
-    return Texture(light, np.full(light.shape, not lost), (t0 + t1) / 2, "exposure")
 
 
 def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
@@ -242,12 +161,15 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
 
 
 def _remarks(raw: list[dict[str, Any]]) -> tuple[str, ...]:
-    rolling = sum(1 for each in raw if each["row_ns"])
-    if not rolling:
+    rolled = [each for each in raw if each["row_ns"]]
+    if not rolled:
         return ()
+    told = f"{len(rolled)} frames have a rolling shutter: "
+    if all(each["late"] is not None for each in rolled):
+        return (told + "every row has its own instant (poses, textures)",)
     return (
-        f"{rolling} frames have a rolling shutter: every row is treated as read when the middle one was "
-        "(poses, textures), so fast shake skews",
+        told + "every row is treated as read when the middle one was (poses, textures), so fast shake skews; fields "
+        "nerf and nerf-fast follow the rows where the poses over the exposure are known",
     )
 
 
@@ -269,13 +191,20 @@ def _read(
     if view.frame.transfer == "srgb":
         decode = linear_from_srgb(decode)
     light = np.asarray(decode, np.float32)[view.frame.pixels]
+    whole = config.field == "splat" or config.colour_target == "truth" or config.moves_cameras or config.spoils_cameras
+    late = None if whole else rolling.late_of(view)
+
+    def given(phase: float) -> Floats:
+        return given_pose(view, number, phase, config, gauge.scale)
+
     made: dict[str, Any] = {
         "name": name,
+        "late": late,
         "light": light,
         "valid": np.array(view.valid),
         "row_ns": view.frame.row_ns,
         "pose": {
-            phase: given_pose(view, number, phase, config, gauge.scale)
+            phase: given(phase) if late is None else rolling.row_poses(view, phase, late)
             for phase in dict.fromkeys((*colour, *tfs, *ratio, *also))
         },
         "beside": {n: t for part in parts_of(config) if part.read for n, t in part.read(scene, view, config).items()},
@@ -285,16 +214,14 @@ def _read(
         made["light"] = _finite(np.array(scene.truth_light(name), np.float32), name, scene)
         made["pose"] = dict.fromkeys(made["pose"], truth_pose(scene, view))
     if config.moves_cameras:
-        made["given"] = [given_pose(view, number, phase, config, gauge.scale) for phase in PATH_PHASES]
+        made["given"] = [given(phase) for phase in PATH_PHASES]
     if config.needs_spikes:
-        clock = scene.clock
-        mean = straight.texture(exposure_mean(view, clock))
+        (mean,) = light_at(view, 0.5, late, scene.clock, straight, exposures(view, scene.clock))
         pairs.add(view.frame.pixels8, light, mean.light, mean.known & view.valid)
         made["mean"], made["mean_known"] = mean.light, mean.known
         for phase in dict.fromkeys((*tfs, *ratio)):
-            tick = spike_tick(view, view.instant_ns(phase), clock)
-            found = textures_at(view.spikes, tick, config.textures, config.texture_window)
-            made["textures"][phase] = [straight.texture(t) for t in found]
+            make = partial(textures_at, kind=config.textures, window=config.texture_window)
+            made["textures"][phase] = light_at(view, phase, late, scene.clock, straight, make)
     return made
 
 
@@ -342,10 +269,13 @@ def _finish(
                     low=config.ratio_min,
                     high=config.ratio_max,
                 ).half()
-        made[phase] = Instant(torch.from_numpy(gauge.pose(pose)), textures, target)
+        poses = gauge.pose(pose) if pose.ndim == 2 else np.stack([gauge.pose(each) for each in pose])
+        made[phase] = Instant(torch.from_numpy(poses), textures, target)
     everywhere = None if valid.all() else torch.from_numpy(valid)
     which = torch.tensor([number])
-    return TrainView(raw["name"], srgb_from_linear(clipped).contiguous(), everywhere, made, None, which, raw["beside"])
+    late = None if raw["late"] is None else torch.from_numpy(raw["late"])
+    frame = srgb_from_linear(clipped).contiguous()
+    return TrainView(raw["name"], frame, everywhere, made, None, which, raw["beside"], late)
 
 
 def _tfs_target(
