@@ -18,6 +18,7 @@ from spikerig.dataset.scene import Floats, View
 from spikerig.dataset.spikes import SpikeStream
 from spikerig.dataset.terminal import Progress
 from spikerig.train.config import FitConfig
+from spikerig.train.deblurred import Deblurred, deblurred, frame_light
 from spikerig.train.gauge import Gauge
 from spikerig.train.gray import Gray, Pairs, solve
 from spikerig.train.losses import mean_weights, ratio_target, srgb_from_linear
@@ -67,7 +68,7 @@ class TrainView:
 class Targets:
     """All training views, the instants each term uses (fractions of the exposure), the converter, remarks.
 
-    `also`: further instants that parts ask for.
+    `also`: further instants that parts ask for; `deblurred`: how pictures were deblurred first, for run.json.
     """
 
     views: tuple[TrainView, ...]
@@ -77,6 +78,7 @@ class Targets:
     gray: Gray | None
     remarks: tuple[str, ...] = field(default=())
     also: tuple[float, ...] = field(default=())
+    deblurred: dict[str, Any] | None = None
 
 
 def views_of_step(targets: Targets, seed: int, step: int, count: int = 1) -> list[TrainView]:
@@ -192,7 +194,8 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
     Raises:
         DataError: no training views, no spikes, no trajectory or no truth where the method needs it; a colour spike
             camera.
-        UsageError: single spikes are asked for, and the spike arm's lens bends.
+        UsageError: single spikes are asked for, and the spike arm's lens bends; a restorer that is not there or may not
+            run.
     Cost: a texture takes milliseconds; memory 12 bytes a pixel and view, +4 a texture, +6 a ratio instant.
     """
     if not scene.train:
@@ -220,13 +223,14 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
         colour, tfs = ratio, (ratio if tfs else ())
     parts = parts_of(config)
     also = tuple(dict.fromkeys(p for part in parts if part.instants is not None for p in part.instants(config)))
+    sharper = deblurred(scene, config)
     pairs, raw, bar = Pairs(), [], Progress("preparing views", len(scene.train), "views")
     for name in scene.train:
-        raw.append(_read(scene, name, config, (colour, tfs, ratio, also), pairs, straight))
+        raw.append(_read(scene, name, config, (colour, tfs, ratio, also), pairs, straight, sharper))
         bar.step()
     gray = solve(pairs, config.gray, scene.light_gain) if config.needs_spikes else None
     views = tuple(_finish(each, k, config, gauge, gray, (colour, tfs, ratio)) for k, each in enumerate(raw))
-    return Targets(views, colour, tfs, ratio, gray, _remarks(raw), also)
+    return Targets(views, colour, tfs, ratio, gray, _remarks(raw), also, sharper.about if sharper else None)
 
 
 def _remarks(raw: list[dict[str, Any]]) -> tuple[str, ...]:
@@ -246,18 +250,14 @@ def _read(
     instants: tuple[tuple[float, ...], ...],
     pairs: Pairs,
     straight: Straight,
+    sharper: Deblurred | None,
 ) -> dict[str, Any]:
-    from spikerig.dataset.images import linear_from_srgb
-
     colour, tfs, ratio, also = instants
     view = scene.view(name, spikes=config.needs_spikes)
-    decode = np.arange(view.frame.full + 1) / view.frame.full
-    if view.frame.transfer == "srgb":
-        decode = linear_from_srgb(decode)
-    light = np.asarray(decode, np.float32)[view.frame.pixels]
+    light = frame_light(view)
     made: dict[str, Any] = {
         "name": name,
-        "light": light,
+        "light": light if sharper is None else sharper.light[name],
         "valid": np.array(view.valid),
         "row_ns": view.frame.row_ns,
         "pose": {phase: sub_pose(view, phase) for phase in dict.fromkeys((*colour, *tfs, *ratio, *also))},
