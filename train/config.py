@@ -19,7 +19,10 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "densify_by": ("all", "colour", "tfs"),
     "exposure": ("off", "affine", "bilateral"),
     "colour_loss": ("l1ssim", "l2"),
-    "colour_target": ("frame", "truth"),
+    "colour_target": ("frame", "truth", "edi", "restored"),
+    "average_domain": ("linear", "encoded"),
+    "event_light": ("linear", "encoded"),
+    "edi_form": ("continuous", "binned"),
     "pose_label": ("mid", "first"),
     "instants_rule": ("midpoints", "endpoints"),
     "textures": ("both", "tfp", "tfi", "tfi-window", "raw"),
@@ -195,6 +198,26 @@ class FitConfig:
     ratio_eps: float = 0.01
     ratio_min: float = 0.15
     ratio_max: float = 6.0
+    # baselines
+    average_domain: str = "linear"
+    event_weight: float = 0.0
+    event_light: str = "linear"
+    event_pos: float = 0.0
+    event_neg: float = 0.0
+    event_shift: float = 0.5
+    event_hinge: float = 0.0
+    edi_form: str = "continuous"
+    edi_bins: int = 4
+    kernel_points: int = 0
+    kernel_start: float = 0.1
+    kernel_align: float = 0.1
+    lr_kernel: float = 5e-3
+    restorer: str = ""
+    trust: bool = False
+    restorer_frames: int = 1
+    restorer_bins: int = 0
+    restorer_pad: int = 8
+    restorer_limit_s: float = 600.0
 
     def __post_init__(self) -> None:
         faults = [
@@ -240,6 +263,7 @@ class FitConfig:
                 "a bilateral grid needs whole pictures (field splat): exposure affine corrects rays too",
             ),
             *self._path_faults(),
+            *self._baseline_faults(),
             (self.pose_label == "first" and self.colour_target == "truth", "the truth is not labelled by pose_label"),
         ]
 
@@ -284,14 +308,48 @@ class FitConfig:
         ]
 
     @property
-    def spoils_cameras(self) -> bool:
-        """Whether the given cameras are made worse, for a study."""
-        return self.pose_noise_deg > 0 or self.pose_noise_share > 0
-
-    @property
     def moves_cameras(self) -> bool:
         """Whether training cameras are not those of the scene."""
         return self.trajectory != "given" or self.pose_noise_deg > 0 or self.pose_noise_share > 0
+
+    def _baseline_faults(self) -> list[tuple[bool, str]]:
+        numbers = ("event_weight", "event_shift", "event_hinge", "event_pos", "event_neg", "kernel_align")
+        edi_at_mid = self.colour_target == "edi" and self.edi_form == "binned" and self.pose_label == "mid"
+        return [
+            *((not 0 <= getattr(self, n) < 1e3, f"{n} must be 0 to 1000") for n in numbers),
+            ((self.event_pos > 0) != (self.event_neg > 0), "event_pos and event_neg are given both or not at all"),
+            (
+                self.average_domain == "encoded" and self.fresh_poses > 0,
+                "fresh_poses remembers linear light: use linear",
+            ),
+            (
+                self.event_weight > 0 and self.poses_per_view < 2,
+                "events tie two sub-poses: poses_per_view must be 2 or more",
+            ),
+            (
+                self.event_weight > 0 and self.instants_rule != "endpoints",
+                "events lie between endpoints: instants_rule",
+            ),
+            (
+                self.event_weight > 0 and self.fresh_poses == 1,
+                "events tie two renders of a step: fresh_poses must not be 1",
+            ),
+            (not 1 <= self.edi_bins <= 1000, "edi_bins must be 1 to 1000"),
+            (edi_at_mid and self.edi_bins % 2 == 1, "mid-exposure is the end of a bin only for even edi_bins"),
+            (not 0 <= self.kernel_points <= 64, "kernel_points must be 0 (no kernel) to 64"),
+            (not 0 <= self.kernel_start <= 1, "kernel_start is a fraction, 0 to 1"),
+            (
+                self.kernel_points > 0 and self.poses_per_view > 1,
+                "a kernel stands for the sub-poses: poses_per_view must be 1",
+            ),
+            (
+                not 1 <= self.restorer_frames <= 99 or self.restorer_frames % 2 == 0,
+                "restorer_frames must be odd, 1 to 99",
+            ),
+            (not 0 <= self.restorer_bins <= 100, "restorer_bins must be 0 (no events) to 100"),
+            (not 1 <= self.restorer_pad <= 256, "restorer_pad must be 1 to 256"),
+            (not 0 < self.restorer_limit_s <= 1e6, "restorer_limit_s must be positive"),
+        ]
 
     @property
     def needs_spikes(self) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from spikerig.dataset.scene import View
     from spikerig.dataset.store import SceneFile
     from spikerig.train.targets import TrainView
+
+
+Draw = Callable[["TrainView", Tensor], list[Tensor]]  # (view, pose) -> renders
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +39,7 @@ class Part:
         rate: (short name, config, fraction of the run done) -> learning rate of a step.
         pose: (params, view, phase, pose, config) -> pose of that instant, [3,4] or [B,3,4].
         expose: (params, view, picture, config) -> the exposed picture as the camera would hand it out.
+        draw: (params, draw, view, pose, step, fit.Task) -> the renders that stand for draw(view, pose), each [H,W,3].
         loss: (fit.State, fit.Task, view, pictures by phase, step) -> terms that are added to the loss.
     """
 
@@ -46,6 +51,7 @@ class Part:
     rate: Callable[[str, FitConfig, float], float] | None = None
     pose: Callable[[Tensors, TrainView, float, Tensor, FitConfig], Tensor] | None = None
     expose: Callable[[Tensors, TrainView, Tensor, FitConfig], Tensor] | None = None
+    draw: Callable[[Tensors, Draw, TrainView, Tensor, Step, Any], list[Tensor]] | None = None
     loss: Callable[[Any, Any, TrainView, dict[float, Tensor], Step], list[Tensor]] | None = None
 
 
@@ -60,6 +66,14 @@ def parts_of(config: FitConfig) -> tuple[Part, ...]:
         from spikerig.train.path import PART as PATH
 
         found.append(PATH)
+    if config.event_weight > 0:
+        from spikerig.train.eventloss import EVENTS
+
+        found.append(EVENTS)
+    if config.kernel_points > 0:
+        from spikerig.train.blurkernel import KERNEL
+
+        found.append(KERNEL)
     return tuple(found)
 
 
@@ -94,6 +108,20 @@ def pose_of(params: Tensors, view: TrainView, phase: float, config: FitConfig) -
         if part.pose is not None:
             pose = part.pose(own(part, params), view, phase, pose, config)
     return pose
+
+
+def drawn_by(params: Tensors, view: TrainView, phase: float, step: Step, task: Any, draw: Draw) -> list[Tensor]:
+    """The field's renders of an instant after all parts; `draw` is the field's own."""
+    for part in parts_of(task.config):
+        if part.draw is not None:
+            draw = partial(_drawn, part.draw, own(part, params), draw, step, task)
+    return draw(view, pose_of(params, view, phase, task.config))
+
+
+def _drawn(
+    hook: Any, params: Tensors, draw: Draw, step: Step, task: Any, view: TrainView, pose: Tensor
+) -> list[Tensor]:
+    return hook(params, draw, view, pose, step, task)
 
 
 def exposed_by(params: Tensors, view: TrainView, picture: Tensor, config: FitConfig) -> Tensor:

@@ -24,6 +24,7 @@ from spikerig.train.model import SplatModel, check_pinhole
 from spikerig.train.parts import parts_of
 from spikerig.train.path import MIDDLE, paths
 from spikerig.train.ply import export_ply
+from spikerig.train.restorer import check_restorer
 from spikerig.train.score import Exam, mean_psnr, novel_views
 from spikerig.train.targets import load_targets
 from spikerig.train.trajectory import PATH_PHASES
@@ -69,6 +70,8 @@ def run_fit(
     from spikerig.dataset.store import open_scene
 
     field_of(config).check(config)  # a missing extra is told before minutes of preparation
+    if config.colour_target == "restored":
+        check_restorer(config)
     if ply and config.field != "splat":
         raise UsageError("only splats can be written as .ply", value=f"field {config.field}", next="leave out --ply")
     begin = time.monotonic()
@@ -123,6 +126,7 @@ def prepare(
         "gray": None if found is None else found.as_json(),
         "effective_tfs_weight": task.weight,
         "remarks": [*targets.remarks, *(part.remark for part in parts_of(config) if part.remark)],
+        "deblurred": targets.deblurred,
         "renders_per_step": {"ratio": 1 if targets.ratio else 0, "average": len({*targets.colour, *targets.tfs})},
     }
     return task, record
@@ -163,6 +167,8 @@ def _start(
     earlier = records.read_json(out / records.RECORD)
     if earlier["scene"]["sha256"] != records.scene_hash(scene.path):
         raise DataError("this is not the scene the run began with", value=scene.path, next="--force starts anew")
+    if (earlier.get("deblurred") or {}).get("sha256") != (task.targets.deblurred or {}).get("sha256"):
+        raise DataError("this is not the restorer the run began with", value=task.config.restorer)
     if earlier.get("points_of") != points_of:
         raise UsageError("a run goes on with the points it began with", value=points_of, expected=earlier["points_of"])
     if earlier["machine"]["isa"] != _isa():
@@ -205,6 +211,11 @@ def _tell(task: Task, record: dict[str, Any]) -> None:
     if (gray := task.targets.gray) is not None and config.tfs_weight > 0:
         k = ", ".join(f"{x:.3f}" for x in gray.weights)
         note(f"  gray ({gray.how}): {k}, bias {gray.bias:+.4f}, white = {gray.white:.3f} spikes a tick")
+    if (sharper := task.targets.deblurred) is not None:
+        note(
+            f"  pictures deblurred first: {sharper['how']}, "
+            + ", ".join(f"{k} {v}" for k, v in sharper.items() if k != "how")
+        )
     for remark in record["remarks"]:
         note(f"  note: {remark}")
 

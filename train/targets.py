@@ -17,6 +17,7 @@ from spikerig.dataset.scene import Floats, View
 from spikerig.dataset.terminal import Progress
 from spikerig.train import rolling
 from spikerig.train.config import FitConfig
+from spikerig.train.deblurred import Deblurred, deblurred, frame_light
 from spikerig.train.gauge import Gauge
 from spikerig.train.gray import Gray, Pairs, solve
 from spikerig.train.losses import mean_weights, ratio_target, srgb_from_linear
@@ -71,7 +72,7 @@ class Targets:
     """All training views, the instants each term uses (fractions of the exposure), the converter, remarks.
 
     `also`: further instants that parts ask for. `given`: where cameras move, the poses [N,5,3,4] of the world that the
-    fit was given at PATH_PHASES.
+    fit was given at PATH_PHASES. `deblurred`: how pictures were deblurred first, for run.json.
     """
 
     views: tuple[TrainView, ...]
@@ -82,6 +83,7 @@ class Targets:
     remarks: tuple[str, ...] = field(default=())
     also: tuple[float, ...] = field(default=())
     given: Floats = field(default_factory=lambda: np.zeros((0, len(PATH_PHASES), 3, 4)))
+    deblurred: dict[str, Any] | None = None
 
 
 def views_of_step(targets: Targets, seed: int, step: int, count: int = 1) -> list[TrainView]:
@@ -114,7 +116,8 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
         DataError: no training views, nothing valid in them, no spikes, no trajectory or no truth where the method
             needs it; a colour spike camera.
         NumericsError: true light that is not finite.
-        UsageError: single spikes are asked for, and the spike arm's lens bends.
+        UsageError: single spikes are asked for, and the spike arm's lens bends; a restorer that is not there or may not
+            run.
     Cost: a texture takes milliseconds; memory 12 bytes a pixel and view, +4 a texture, +6 a ratio instant.
     """
     if not scene.train:
@@ -142,9 +145,10 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
         colour, tfs = ratio, (ratio if tfs else ())
     parts = parts_of(config)
     also = tuple(dict.fromkeys(p for part in parts if part.instants is not None for p in part.instants(config)))
+    sharper = deblurred(scene, config)
     pairs, raw, bar = Pairs(), [], Progress("preparing views", len(scene.train), "views")
     for number, name in enumerate(scene.train):
-        raw.append(_read(scene, name, number, config, gauge, (colour, tfs, ratio, also), pairs, straight))
+        raw.append(_read(scene, name, number, config, gauge, (colour, tfs, ratio, also), pairs, straight, sharper))
         bar.step()
     if not any(each["valid"].any() for each in raw):
         raise DataError(
@@ -157,7 +161,8 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
     gray = solve(pairs, config.gray, scene.light_gain) if config.needs_spikes else None
     views = tuple(_finish(each, k, config, gauge, gray, (colour, tfs, ratio)) for k, each in enumerate(raw))
     given = [each["given"] for each in raw] if config.moves_cameras else np.zeros((0, len(PATH_PHASES), 3, 4))
-    return Targets(views, colour, tfs, ratio, gray, _remarks(raw), also, np.array(given))
+    about = None if sharper is None else sharper.about
+    return Targets(views, colour, tfs, ratio, gray, _remarks(raw), also, np.array(given), about)
 
 
 def _remarks(raw: list[dict[str, Any]]) -> tuple[str, ...]:
@@ -182,17 +187,14 @@ def _read(
     instants: tuple[tuple[float, ...], ...],
     pairs: Pairs,
     straight: Straight,
+    sharper: Deblurred | None,
 ) -> dict[str, Any]:
-    from spikerig.dataset.images import linear_from_srgb
-
     colour, tfs, ratio, also = instants
     view = scene.view(name, spikes=config.needs_spikes)
-    decode = np.arange(view.frame.full + 1) / view.frame.full
-    if view.frame.transfer == "srgb":
-        decode = linear_from_srgb(decode)
-    light = np.asarray(decode, np.float32)[view.frame.pixels]
-    whole = config.field == "splat" or config.colour_target == "truth" or config.moves_cameras or config.spoils_cameras
-    late = None if whole else rolling.late_of(view)
+    light = frame_light(view)
+    late = None
+    if config.field != "splat" and config.colour_target != "truth" and not config.moves_cameras:
+        late = rolling.late_of(view)
 
     def given(phase: float) -> Floats:
         return given_pose(view, number, phase, config, gauge.scale)
@@ -200,7 +202,7 @@ def _read(
     made: dict[str, Any] = {
         "name": name,
         "late": late,
-        "light": light,
+        "light": light if sharper is None else sharper.light[name],
         "valid": np.array(view.valid),
         "row_ns": view.frame.row_ns,
         "pose": {

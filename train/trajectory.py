@@ -95,7 +95,7 @@ def given_pose(view: View, number: int, phase: float, config: FitConfig, scale: 
     moves = view.trajectory is not None and len(view.trajectory.at_ns) > 1
     still = config.trajectory != "given" and (config.path_from == "mid" or not moves)
     pose = sub_pose(view, 0.5 if still else phase)
-    if not config.spoils_cameras:
+    if config.pose_noise_deg == 0 and config.pose_noise_share == 0:
         return pose
     size = np.repeat([np.radians(config.pose_noise_deg), config.pose_noise_share / scale], 3)
     off, drift = np.random.default_rng((config.seed, 8, number)).normal(size=(2, 6))
