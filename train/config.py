@@ -25,6 +25,10 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "tfs_domain": ("encoded", "linear", "luma", "naive"),
     "highlights": ("clip", "keep"),
     "gray": ("calibrated", "rec601", "learned"),
+    "restore_colour": ("model", "frame"),
+    "restore_light": ("interval", "instant"),
+    "restore_gain": ("bayes", "full"),
+    "restore_white": ("flat", "ratio"),
     "weight_reading": ("mean", "sum-batch", "sum-image", "u8"),
     "device": ("cpu", "cuda"),
 }
@@ -136,6 +140,14 @@ class FitConfig:
     ratio_eps: float = 0.01
     ratio_min: float = 0.15
     ratio_max: float = 6.0
+    # ours
+    restore_instants: int = 0
+    restore_colour: str = "model"
+    restore_rounds: int = 10
+    restore_from: float = 0.1
+    restore_light: str = "interval"
+    restore_gain: str = "bayes"
+    restore_white: str = "flat"
 
     def __post_init__(self) -> None:
         faults = [
@@ -187,7 +199,7 @@ class FitConfig:
     @property
     def needs_spikes(self) -> bool:
         """Whether any term reads spikes."""
-        return self.tfs_weight > 0 or self.ratio_until > 0
+        return self.tfs_weight > 0 or self.ratio_until > 0 or self.restore_instants > 0
 
     @property
     def needs_trajectory(self) -> bool:
@@ -195,7 +207,7 @@ class FitConfig:
         many = self.poses_per_view > 1 and self.ratio_until < 1
         textures = self.tfs_weight > 0 and self.textures_per_view > 1
         ratio = self.ratio_until > 0 and self.ratio_instants > 1
-        return many or textures or ratio or self.pose_label == "first"
+        return many or textures or ratio or self.restore_instants > 1 or self.pose_label == "first"
 
     def as_json(self) -> dict[str, Any]:
         """A JSON-ready record of every setting."""

@@ -49,7 +49,14 @@ class Part:
 
 def parts_of(config: FitConfig) -> tuple[Part, ...]:
     """The parts that a config asks for, in the order in which they act."""
-    return ()
+    parts = []
+    if config.restore_instants > 0:
+        from spikerig.train import restore
+
+        parts.append(
+            Part("restore", instants=restore.instants, read=restore.read, start=restore.start, loss=restore.loss)
+        )
+    return tuple(parts)
 
 
 def part_of(config: FitConfig, parameter: str) -> tuple[Part, str] | None:

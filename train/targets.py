@@ -218,6 +218,8 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
     ratio = phases(config.ratio_instants, "midpoints", config.pose_label) if config.ratio_until > 0 else ()
     if config.ratio_until >= 1:
         colour, tfs = ratio, (ratio if tfs else ())
+    if config.restore_instants > 0:
+        colour = ()  # the part has a colour term of its own
     parts = parts_of(config)
     also = tuple(dict.fromkeys(p for part in parts if part.instants is not None for p in part.instants(config)))
     pairs, raw, bar = Pairs(), [], Progress("preparing views", len(scene.train), "views")
