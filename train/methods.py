@@ -98,8 +98,9 @@ def ours(config: FitConfig) -> FitConfig:
         config,
         method="ours",
         fresh_poses=1,
-        restore_instants=9,
+        restore_instants=5,
         texture_window=24,
+        highlights="keep",
     )
 
 

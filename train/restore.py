@@ -24,8 +24,7 @@ from spikerig.train.config import FitConfig
 from spikerig.train.field import Step, Tensors
 from spikerig.train.gray import BRIGHTEST
 from spikerig.train.losses import light_of, srgb_from_linear
-from spikerig.train.trajectory import phases, sub_pose
-from spikerig.train.unblur import path_of, unblur
+from spikerig.train.trajectory import phases
 
 if TYPE_CHECKING:
     from spikerig.dataset.scene import View
@@ -81,45 +80,21 @@ def intervals_at(stream: SpikeStream, tick: float, window: int, straight: Straig
 
 
 def read(scene: SceneFile, view: View, config: FitConfig) -> dict[str, Tensor]:
-    """Of a view: the frame's light, its clipped channels, the exposure's mean of the spikes, and by instant the
-    interval there (light, relative variance, first and last as fractions of the exposure) as `instant J` [H,W,4]."""
-    from spikerig.dataset.images import linear_from_srgb
+    """Of a view: the exposure's mean of the spikes [H,W], and by instant the interval there (light, relative variance,
+    first and last as fractions of the exposure) as `instant J` [H,W,4]."""
     from spikerig.train.targets import exposure_mean, spike_tick, spikes_of
 
     straight, stream = straight_of(scene), spikes_of(view)
     begin, end = (spike_tick(view, view.instant_ns(phase), scene.clock) for phase in (0.0, 1.0))
     mean = straight.texture(exposure_mean(view, scene.clock))
-    codes = view.frame.pixels / np.float32(view.frame.full)
-    light = linear_from_srgb(codes) if view.frame.transfer == "srgb" else codes
-    made = {
-        "light": torch.from_numpy(np.ascontiguousarray(light, np.float32)),
-        "clipped": torch.from_numpy(view.frame.pixels8 > BRIGHTEST),
-        "mean": torch.from_numpy(np.where(mean.known, mean.light, np.float32(0))),
-    }
+    made = {"mean": torch.from_numpy(np.where(mean.known, mean.light, np.float32(0)))}
     for j, phase in enumerate(instants(config)):
         tick = spike_tick(view, view.instant_ns(phase), scene.clock)
         found = intervals_at(stream, tick, config.texture_window, straight)
         ends = [(t - begin) / (end - begin) for t in (found.first, found.last)]
         stacked = np.stack([found.light, found.variance, *ends], -1)
-        if config.restore_rounds > 0:
-            made[f"colour {j}"] = _colour(scene, view, config, phase, made, found).half()
         made[f"instant {j}"] = torch.from_numpy(np.ascontiguousarray(stacked, np.float32))
     return made
-
-
-def _colour(scene, view, config, phase, made, found) -> Tensor:
-    k = torch.tensor([0.299, 0.587, 0.114])
-    poses = [sub_pose(view, p) for p in instants(config)]
-    at = sub_pose(view, phase)
-    p = scene.points.xyz @ at[:, :3].T + at[:, 3]
-    q = p @ scene.camera.K.T
-    uv = q[:, :2] / q[:, 2:]
-    ok = (p[:, 2] > 0.1) & (uv >= 0).all(1) & (uv[:, 0] < scene.camera.width) & (uv[:, 1] < scene.camera.height)
-    path = path_of(scene.camera, poses, at, float(np.median(p[ok, 2])))
-    whole = made["light"] @ k
-    light = torch.from_numpy(found.light)
-    gray = torch.where(light > 0, light * whole / made["mean"].clamp(min=1e-6), whole)
-    return unblur(made["light"], gray, k, path, config.restore_rounds)
 
 
 def start(task: Any) -> Tensors:
@@ -131,12 +106,17 @@ def start(task: Any) -> Tensors:
     height, width = task.camera.height, task.camera.width
     spikes, gray = torch.full((height, width), DIM), torch.full((height, width), DIM)
     for view in task.targets.views:
-        good = (view.beside["mean"] > 0) & ~view.beside["clipped"].any(-1)
+        good = (view.beside["mean"] > 0) & ~clipped_in(view).any(-1)
         if view.valid is not None:
             good &= view.valid
         spikes += torch.where(good, view.beside["mean"] / white, 0.0)
-        gray += torch.where(good, gray_light(view.beside["light"], weights), 0.0)
+        gray += torch.where(good, gray_light(light_of(view.frame), weights), 0.0)
     return {"flat": (spikes / gray).clamp(1 / MOST, MOST)}
+
+
+def clipped_in(view: TrainView) -> Tensor:
+    """bool[H,W,3]: channels of the frame at, or next to, their end."""
+    return view.frame > BRIGHTEST / 255
 
 
 def gray_light(light: Tensor, weights: Tensor) -> Tensor:
@@ -152,7 +132,8 @@ def loss(state: Any, task: Any, view: TrainView, pictures: dict[float, Tensor], 
     drawn = [p for p in order if p in pictures]
     if not drawn:
         return []
-    lights = [light_of(pictures[p]) if p in pictures else state.memory[view.name, p].float() for p in order]
+    kept = [light_of(pictures[p]) if p in pictures else state.memory[view.name, p].float() for p in order]
+    lights = [light.clamp(min=0) for light in kept]
     flat = state.params["restore:flat"].detach()
     flat = flat if view.pixels is None else flat.reshape(-1)[view.pixels][:, None]
     early = step.fraction < config.restore_from or config.restore_colour == "frame"
@@ -175,36 +156,39 @@ def restored(view: TrainView, j: int, lights: list[Tensor], flat: Tensor, task: 
         early: the colour is still the frame's.
     """
     config, gray, white = task.config, task.gray, task.targets.gray.white
-    frame, keep = view.beside["light"], config.highlights == "keep"
-    clipped = view.beside["clipped"]
+    frame, clipped, keep = light_of(view.frame), clipped_in(view), config.highlights == "keep"
     if early:
-        colour = view.beside[f"colour {j}"].float() if config.restore_rounds else frame
-        seen = [colour]
+        colour, grays = frame, []
     else:
-        mean = sum(lights[1:], lights[0]) / len(lights)
-        factor = ((frame + DIM) / (mean + DIM)).clamp(1 / MOST, MOST)
-        factor = (factor ** float(__import__("os").environ.get("ALPHA", "1"))).clamp(1 / MOST, MOST)
-        if keep:  # a clipped channel only says that it was at least so bright
-            factor = torch.where(clipped, factor.clamp(min=1.0), factor)
-        colour = lights[j].clamp(min=0) * factor
-        seen = [light.clamp(min=0) * factor for light in lights] if config.restore_light == "interval" else [colour]
+        factor = missing(frame, clipped if keep else None, lights)
+        colour = lights[j] * factor
+        grays = [gray_light(light * factor, gray) for light in lights] if config.restore_light == "interval" else []
     found, variance, first, last = view.beside[f"instant {j}"].unbind(-1)
     own = gray_light(colour, gray)
-    predicted = own if len(seen) == 1 else covered([gray_light(s, gray) for s in seen], first, last)
+    predicted = covered(grays, first, last) if grays else own
     measured = found / white / flat
     if config.restore_white == "ratio":  # the frame's own gray says what the exposure's spikes mean
         exact = (view.beside["mean"] > 0) & ~clipped.any(-1)
-        whole = gray_light(frame, gray)
-        measured = torch.where(exact, found * whole / view.beside["mean"].clamp(min=1e-6), measured)
-    innovation = (measured / predicted - 1).clamp(1 / MOST - 1, MOST - 1)
+        ratio = gray_light(frame, gray) / view.beside["mean"].clamp(min=1e-6)
+        measured = torch.where(exact, found * ratio, measured)
     known = found > 0
+    innovation = torch.where(known, (measured / predicted - 1).clamp(1 / MOST - 1, MOST - 1), 0.0)
     if config.restore_gain == "bayes" and not early:
         innovation = innovation * kalman(innovation, variance, known)
-    ratio = torch.where(known, 1 + innovation, 1.0)
     bias = float(gray[3])
-    ratio = ((own * ratio - bias) / (own - bias).clamp(min=DIM)).clamp(1 / MOST, MOST) if bias else ratio
-    target = colour * ratio[..., None]
+    light = (own * (1 + innovation) - bias).clamp(min=0) / (own - bias).clamp(min=DIM)
+    target = colour * light.clamp(1 / MOST, MOST)[..., None]
     return srgb_from_linear(target if keep else target.clamp(0.0, 1.0))
+
+
+def missing(frame: Tensor, clipped: Tensor | None, lights: list[Tensor]) -> Tensor:
+    """What the mean of renders lacks to be the frame, as a factor [H,W,3]: Richardson and Lucy's B / A.
+
+    `clipped` bool[H,W,3]: channels that only say that there was at least so much light; their factor is at least 1.
+    """
+    mean = sum(lights[1:], lights[0]) / len(lights)
+    factor = ((frame + DIM) / (mean + DIM)).clamp(1 / MOST, MOST)
+    return factor if clipped is None else torch.where(clipped, factor.clamp(min=1.0), factor)
 
 
 def covered(grays: list[Tensor], first: Tensor, last: Tensor) -> Tensor:

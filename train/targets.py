@@ -17,6 +17,7 @@ from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.scene import Floats, View
 from spikerig.dataset.spikes import SpikeStream
 from spikerig.dataset.terminal import Progress
+from spikerig.train.arms import align
 from spikerig.train.config import FitConfig
 from spikerig.train.gauge import Gauge
 from spikerig.train.gray import Gray, Pairs, solve
@@ -227,8 +228,20 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
         raw.append(_read(scene, name, config, (colour, tfs, ratio, also), pairs, straight))
         bar.step()
     gray = solve(pairs, config.gray, scene.light_gain) if config.needs_spikes else None
+    remarks = _remarks(raw)
+    if gray is not None and config.align_arms != "off":
+        motion = align(raw, np.array([*gray.weights, gray.bias]), gray.white, config.align_arms)
+        pairs = Pairs()
+        for each in raw:
+            pairs.add(each["codes"], each["light"], each["mean"], each["mean_known"] & each["valid"])
+        gray = solve(pairs, config.gray, scene.light_gain)
+        x, y = motion.shift_px
+        remarks += (
+            f"frames were moved by {x:+.2f}, {y:+.2f} px to meet the spikes ({config.align_arms}; rms of the grays' "
+            f"difference {motion.rms_before:.4f} -> {motion.rms_after:.4f} of white)",
+        )
     views = tuple(_finish(each, k, config, gauge, gray, (colour, tfs, ratio)) for k, each in enumerate(raw))
-    return Targets(views, colour, tfs, ratio, gray, _remarks(raw), also)
+    return Targets(views, colour, tfs, ratio, gray, remarks, also)
 
 
 def _remarks(raw: list[dict[str, Any]]) -> tuple[str, ...]:
@@ -273,7 +286,7 @@ def _read(
         clock = scene.clock
         mean = straight.texture(exposure_mean(view, clock))
         pairs.add(view.frame.pixels8, light, mean.light, mean.known & view.valid)
-        made["mean"], made["mean_known"] = mean.light, mean.known
+        made["mean"], made["mean_known"], made["codes"] = mean.light, mean.known, view.frame.pixels8
         for phase in dict.fromkeys((*tfs, *ratio)):
             tick = spike_tick(view, view.instant_ns(phase), clock)
             found = textures_at(view.spikes, tick, config.textures, config.texture_window)
@@ -291,7 +304,7 @@ def _finish(
 ) -> TrainView:
     _, tfs, ratio = instants
     light, valid = torch.from_numpy(raw["light"]), raw["valid"]
-    clipped = light.clamp(0, 1)
+    clipped = light.clamp(0, None if config.highlights == "keep" else 1)  # a truth may be brighter than white
     made: dict[float, Instant] = {}
     for phase, pose in raw["pose"].items():
         textures, target = (), torch.zeros(0, dtype=torch.half)
