@@ -34,6 +34,11 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "knots_at": ("even", "spikes"),
     "path_from": ("given", "mid"),
     "anchor": ("mean", "mid", "none"),
+    "align_arms": ("off", "shift", "affine"),
+    "restore_colour": ("model", "frame"),
+    "restore_light": ("interval", "instant"),
+    "restore_gain": ("bayes", "full"),
+    "restore_white": ("flat", "ratio"),
     "weight_reading": ("mean", "sum-batch", "sum-image", "u8"),
     "device": ("cpu", "cuda"),
 }
@@ -105,6 +110,16 @@ class FitConfig:
 
     Ratio: until `ratio_until` of the run the colour target is the frame times the ratio of the texture at one of
     `ratio_instants` instants (a random one a step) to the exposure's mean.
+
+    Ours (train/restore.py): with `restore_instants` n > 0 each of n instants has a target made of the model's own renders,
+    in place of the colour term; fields of rays render all n a step. `restore_colour`: the target's colour is the
+    frame's, or from `restore_from` of the run on the model's, times what its own blur lacks to be the frame.
+    `restore_light`: an interval between spikes is compared with the renders it covers, or with its instant's.
+    `restore_gain`: spikes correct the gray fully, or by what they are worth against what the model knows (bayes).
+    `restore_white`: what a spike means comes from the frame's own gray (ratio), or from a flat field that all views give.
+    `texture_window` bounds the intervals; with `highlights` keep, light above white is trained from spikes, and channels
+    that clip only say "at least". `align_arms` (any method with spikes, train/arms.py): frames are first moved onto the
+    spikes by the shift or affine motion that all views together show.
     """
 
     field: str = "splat"
@@ -218,6 +233,14 @@ class FitConfig:
     restorer_bins: int = 0
     restorer_pad: int = 8
     restorer_limit_s: float = 600.0
+    # ours
+    align_arms: str = "off"
+    restore_instants: int = 0
+    restore_colour: str = "model"
+    restore_from: float = 0.1
+    restore_light: str = "interval"
+    restore_gain: str = "bayes"
+    restore_white: str = "flat"
 
     def __post_init__(self) -> None:
         faults = [
@@ -250,6 +273,7 @@ class FitConfig:
                 (not 0 <= getattr(self, n) <= 1, f"{n} is a fraction, 0 to 1")
                 for n in ("ratio_until", "sh_warmup", "densify_until", "densify_from", "tfs_from")
             ),
+            *self._restore_faults(),
             (self.ratio_eps <= 0, "ratio_eps must be positive"),
             (not 0 < self.ratio_min <= 1 <= self.ratio_max, "ratio_min <= 1 <= ratio_max must hold"),
             *self._growth_faults(),
@@ -278,6 +302,18 @@ class FitConfig:
             (not 0 < self.densify_share <= 1, "densify_share must be in (0, 1]"),
             (not (self.densify_size > 0 and self.huge > 0), "densify_size and huge must be positive"),
             (self.opacity_reset < 0, "opacity_reset must be 0 (none) or more steps"),
+        ]
+
+    def _restore_faults(self) -> list[tuple[bool, str]]:
+        on = self.restore_instants > 0
+        return [
+            (not 0 <= self.restore_instants <= 99, "restore_instants must be 0 (off) to 99"),
+            (not 0 <= self.restore_from <= 1, "restore_from is a fraction, 0 to 1"),
+            (on and self.ratio_until > 0, "restored instants take the ratio targets' place: ratio_until must be 0"),
+            (on and self.colour_target == "truth", "the truth needs no restoring: restore_instants must be 0"),
+            (on and self.pose_label == "first", "instants are restored about mid-exposure: pose_label must be mid"),
+            (on and self.tfs_weight > 0 and self.textures_per_view > 1, "with restored instants TfS has one texture"),
+            (self.align_arms != "off" and not self.needs_spikes, "without spikes there are no arms to align"),
         ]
 
     def _ray_faults(self) -> list[tuple[bool, str]]:
@@ -354,7 +390,7 @@ class FitConfig:
     @property
     def needs_spikes(self) -> bool:
         """Whether any term reads spikes."""
-        return self.tfs_weight > 0 or self.ratio_until > 0
+        return self.tfs_weight > 0 or self.ratio_until > 0 or self.restore_instants > 0
 
     @property
     def needs_trajectory(self) -> bool:
@@ -364,7 +400,7 @@ class FitConfig:
         many = self.poses_per_view > 1 and self.ratio_until < 1
         textures = self.tfs_weight > 0 and self.textures_per_view > 1
         ratio = self.ratio_until > 0 and self.ratio_instants > 1
-        return many or textures or ratio or self.pose_label == "first"
+        return many or textures or ratio or self.restore_instants > 1 or self.pose_label == "first"
 
     def as_json(self) -> dict[str, Any]:
         """A JSON-ready record of every setting."""

@@ -74,6 +74,12 @@ def parts_of(config: FitConfig) -> tuple[Part, ...]:
         from spikerig.train.blurkernel import KERNEL
 
         found.append(KERNEL)
+    if config.restore_instants > 0:
+        from spikerig.train import restore
+
+        found.append(
+            Part("restore", instants=restore.instants, read=restore.read, start=restore.start, loss=restore.loss)
+        )
     return tuple(found)
 
 
