@@ -84,11 +84,11 @@ def intervals_at(stream: SpikeStream, tick: float, window: int, straight: Straig
 def read(scene: SceneFile, view: View, config: FitConfig) -> dict[str, Tensor]:
     """Of a view: the exposure's mean of the spikes [H,W], and by instant the interval there (light, relative variance,
     first and last as fractions of the exposure) as `instant J` [H,W,4]."""
-    from spikerig.train.spikelight import exposure_mean, spike_tick, spikes_of
+    from spikerig.train.spikelight import exposures, light_at, spike_tick, spikes_of
 
     straight, stream = straight_of(scene), spikes_of(view)
     begin, end = (spike_tick(view, view.instant_ns(phase), scene.clock) for phase in (0.0, 1.0))
-    mean = straight.texture(exposure_mean(view, scene.clock))
+    (mean,) = light_at(view, 0.5, None, scene.clock, straight, exposures(view, scene.clock))
     made = {"mean": torch.from_numpy(np.where(mean.known, mean.light, np.float32(0)))}
     for j, phase in enumerate(instants(config)):
         tick = spike_tick(view, view.instant_ns(phase), scene.clock)
