@@ -16,16 +16,19 @@ from spikerig.dataset.errors import DataError, RefusedError
 from spikerig.dataset.gopro_file import GoProClip, open_gopro
 from spikerig.dataset.gopro_pictures import read_pictures
 from spikerig.dataset.images import linear_from_srgb, srgb8_from_linear
+from spikerig.dataset.marks import Sight
 from spikerig.dataset.rawtake import RawTake, TakenView, WireBytes, open_take
 from spikerig.dataset.scene import Camera, Frame, Pose, View
 from spikerig.dataset.store_write import SceneWriter
 from spikerig.dataset.stream import SpikeStream
 from spikerig.dataset.wire import WireProfile
 from spikerig.dataset.wire_ticks import ticks_from_wire
-from spikerig.rigctl.ingest_sights import panel_mask, panel_pairs, sights
-from spikerig.rigctl.ingest_slips import MendedBytes
+from spikerig.rigctl.ingest_led import LedSights, led_sights
+from spikerig.rigctl.ingest_sights import panel_in_view, panel_mask, sights
+from spikerig.rigctl.ingest_slips import mended
 from spikerig.rigctl.ingest_times import LATE_TICKS, Framing, Times, read_truth
 from spikerig.rigctl.ingest_truth import TrueWorld
+from spikerig.rigctl.led_view import led_plan
 
 MARGIN_TICKS = 256
 
@@ -95,14 +98,21 @@ def ingest(
         raise DataError("the take has no viewpoint that was kept", value=take.folder)
     truth = read_truth(take)
     times = Times(take, truth)
-    wire = MendedBytes(take, [s for v in views for s in v.spikes])
-    views = [replace(v, spikes=tuple((e, wire.sent(e, a), wire.sent(e, b)) for e, a, b in v.spikes)) for v in views]
-    framing = Framing(wire, [s for v in views for s in v.spikes], panel_pairs(take))
+    wire, views = mended(take, views)
+    panel, led = panel_in_view(take.plan), led_plan(take.plan)
+    framing = Framing(wire, [s for v in views for s in v.spikes], panel.pairs if panel else ())
     wanted = bool(truth) if config.truth is None else config.truth
-    world = TrueWorld(take, times, truth) if wanted else None
-    seen, times.missing = sights(take, views, times.clocks, wire, framing, begin("reading the panel", len(views)))
+    blinked: LedSights | None = None
+    seen: list[Sight] = []
+    done = begin("reading the panel" if led is None else "reading the LED", len(views))
+    if led is not None:
+        blinked = led_sights(take, views, led, times.marks, wire, framing, done)
+        seen, times.missing = blinked.sights, blinked.missing
+    elif panel is not None:
+        seen, times.missing = sights(take, views, panel, times.marks, wire, framing, done)
     if seen:
         times.fit(seen)
+    world = TrueWorld(take, times, truth) if wanted else None
     size = take.profile
     camera = world.camera if world else Camera.pinhole(size.width, size.height, config.fov_deg)
     held = _held_out(take, config)
@@ -110,6 +120,7 @@ def ingest(
     told: dict[str, Any] = {
         "views": 0, "test": [], "left_out": {}, "lost_ticks": 0, "sigma_us": 0.0, "rgb_times": {},
         "sights": len(seen), "panel_unread": times.missing, "slips": [asdict(s) for s in wire.slips],
+        "led": None if blinked is None else blinked.as_json(),
     }  # fmt: skip
     done = begin("cutting", len(views))
     hidden = panel_mask(take)
@@ -125,13 +136,14 @@ def ingest(
             for number, cut in enumerate(cuts):
                 name = view.name if config.frames == 1 else f"{view.name}-{number}"
                 split = "test" if view.name in held else "train"
-                _add(writer, _plain(name, cut, split, hidden), view, cut, world, told)
+                dark = blinked.hidden(view.name, size.height, size.width) if blinked else hidden
+                _add(writer, _plain(name, cut, split, dark), view, cut, world, told)
             done()
         if not told["views"]:
             raise DataError("no view can be made of this take", value="; ".join(
                 dict.fromkeys(told["left_out"].values())))  # fmt: skip
         info["clocks"]["rgb"] = told["rgb_times"]
-        writer.info = {**info, "left_out": told["left_out"], "slips": told["slips"]}
+        writer.info = {**info, "left_out": told["left_out"], "slips": told["slips"], "led": told["led"]}
         if world:
             writer.points = world.points()
     return {"scene": str(out), **told}

@@ -33,7 +33,9 @@ def fit(
         str | None,
         typer.Option(help="What w multiplies: mean, sum-batch, sum-image, u8 (the paper does not say)."),
     ] = None,
-    gray: Annotated[str | None, typer.Option(help="RGB to gray: calibrated, rec601, learned (the paper's).")] = None,
+    gray: Annotated[
+        str | None, typer.Option(help="RGB to gray: calibrated, rec601, learned (the paper's), constrained, response.")
+    ] = None,
     pose_label: Annotated[
         str | None, typer.Option(help="Pose a blurry view is labelled with: mid or first (of its exposure).")
     ] = None,

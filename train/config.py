@@ -15,7 +15,9 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "field": ("splat", "nerf", "nerf-fast"),
     "init": ("points", "random"),
     "background": ("black", "white", "random"),
-    "densify": ("off", "mcmc"),
+    "densify": ("off", "mcmc", "default"),
+    "densify_by": ("all", "colour", "tfs"),
+    "exposure": ("off", "affine", "bilateral"),
     "colour_loss": ("l1ssim", "l2"),
     "colour_target": ("frame", "truth", "edi", "restored"),
     "average_domain": ("linear", "encoded"),
@@ -27,17 +29,23 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "tfs_combine": ("average", "sum"),
     "tfs_domain": ("encoded", "linear", "luma", "naive"),
     "highlights": ("clip", "keep"),
-    "gray": ("calibrated", "rec601", "learned"),
+    "gray": ("calibrated", "rec601", "learned", "constrained", "response"),
+    "trajectory": ("given", "linear", "cubic"),
+    "knots_at": ("even", "spikes"),
+    "path_from": ("given", "mid"),
+    "anchor": ("mean", "mid", "none"),
     "weight_reading": ("mean", "sum-batch", "sum-image", "u8"),
     "device": ("cpu", "cuda"),
 }
 PAPER_BATCH = 1024
 SPLAT_ONLY = {
-    "splats", "init", "init_opacity", "init_scale", "antialias", "densify", "densify_every", "densify_until", "noise",
+    "splats", "init_opacity", "init_scale", "antialias", "densify", "densify_every", "densify_until", "noise",
+    "densify_from", "densify_by", "densify_grad", "densify_size", "densify_share", "splats_most", "huge", "absgrad",
+    "opacity_reset",
     "opacity_reg", "scale_reg", "sh_warmup", "ssim_weight", "fresh_poses", "lr_means", "lr_scales", "lr_quats",
     "lr_opacities", "lr_colours",
 }  # fmt: skip
-FAST_ONLY = {"grid_levels", "coarsest", "finest", "table_log2", "occupancy", "lr_grid"}
+FAST_ONLY = {"grid_levels", "coarsest", "finest", "table_log2", "occupancy", "probes", "lr_grid"}
 RAYS_ONLY = {"rays", "views_per_step", "coarse", "fine", "width", "lr_net", *FAST_ONLY}
 
 
@@ -45,14 +53,24 @@ RAYS_ONLY = {"rays", "views_per_step", "coarse", "fine", "width", "lr_net", *FAS
 class FitConfig:
     """All knobs of a fit; units in the names or beside them.
 
-    Model: `splats` is the number to start with (points are thinned or duplicated to it) and the cap of densification;
+    Model: `splats` is the number to start with (points are thinned or duplicated to it), `splats_most` the cap of
+    densification (0: `splats` itself for mcmc, four times it for default);
     learning rates are per step at the start of the run and fall exponentially to `lr_end` times that, by the fraction
     of steps done, or of seconds spent where `seconds` > 0. `lr_means` is in units of the normalised scene ([-1, 1]).
 
+    Densification, every `densify_every` steps between the fractions `densify_from` (default only) and `densify_until`
+    of the run. mcmc: `noise`. default (train/grow.py): splats whose mean screen gradient is above `densify_grad` (loss
+    per half picture; 0: 2e-4, or 8e-4 with `absgrad`, which sums its absolute values over pixels) are cloned, or split
+    where larger than `densify_size`, at most `densify_share` of all in a round; those fainter than 0.005 are dropped,
+    and after the first of the opacity resets every `opacity_reset` steps (0: none) those larger than `huge` (gauge
+    units). `densify_by`: the gradient of the whole loss, or of the colour or the TfS term alone.
+
     Rays (fields nerf and nerf-fast): a step draws `rays` pixels, from `views_per_step` views in equal shares. `coarse`
     and `fine` are samples a ray: of the two networks of nerf; for nerf-fast the places looked up in the occupancy grid,
-    and those the network sees. `width` is that of the hidden layers; `grid_levels` levels of a hash grid go from
-    `coarsest` to `finest` cells along an axis with at most 2^`table_log2` rows each; `occupancy` cells along an axis.
+    and those the networks are trained at; with `probes` > 0 the density of so many places, looked up without gradient,
+    says where those are. nerf-fast starts from the scene's points, or with `init` random from nothing. `width` is that
+    of the hidden layers; `grid_levels` levels of a hash grid go from `coarsest` to `finest` cells along an axis with at
+    most 2^`table_log2` rows each; `occupancy` cells along an axis.
 
     Camera: a blurry frame is explained by `poses_per_view` sub-poses of its exposure, averaged in linear light. One
     sub-pose is the instant of `pose_label` (the paper does not say which). More lie at (j+1/2)/n of the exposure
@@ -60,13 +78,30 @@ class FitConfig:
     at random, and remembers the last renders of the others (the gradient is scaled by n/k): the average at the cost
     of k renders a step instead of n.
 
+    Paths: `trajectory` given trains no camera. With linear or cubic, every training camera's pose is that given times
+    an SE(3) spline in its frame that is optimised with the scene: screws between `knots` knots (0: 2), or a cumulative
+    cubic B-spline of as many control poses (0: 4). Knots lie evenly over the exposure (`knots_at` even), or the pieces
+    of the spline end at the instants of the textures (spikes; `knots` is 0 then). `path_from` given starts at the
+    scene's trajectory, or at the mid-exposure pose, which then stands for all instants, where it has none; mid always
+    does the latter. `anchor` mean: what all cameras do in common (a motion, a scale) is projected out; mid:
+    mid-exposure poses hold, only the motion around them is learned; none. Rates `lr_poses` (radians and the normalised
+    scene's units) fall to `lr_poses_end` times that. For studies, `pose_noise_deg` degrees and `pose_noise_share` of
+    half the scene's size about each axis (standard deviations, drawn by seed and view) are put onto the poses given; at
+    the exposure's ends as much again, halved, in opposite directions.
+
     TfS: `tfs_weight` in the reading `weight_reading` of Eq. TfS (`effective_weight` maps it); textures at
     `textures_per_view` instants, of kind `textures` (`both` = TFP and TFI, averaged to one residual by `tfs_combine`
     average, or two losses by sum; `tfi-window` = TFI over as many intervals as fit into `texture_window` ticks, the
     least noisy; `raw` = the spike bit itself). `tfs_domain`: encoded = sRGB of texture against sRGB
     of the gray of the linearised render; linear = both linear; luma = gray of the encoded render against the encoded
     texture; naive = gray of the encoded render against the linear texture (wrong, for the ablation). `highlights`:
-    clip textures to display white, where RGB ends too, or keep them.
+    clip textures to display white, where RGB ends too, or keep them. `gray`: how RGB becomes what a spike sees:
+    calibrated before training and frozen; rec601; learned (the paper's, free); constrained (learned, positive weights
+    of fixed sum); response (constrained, then a learned monotone curve). Learned ones start from Rec.601.
+    `tfs_from`: fraction of the run where TfS begins.
+
+    Exposure (train/exposure.py): frames of different gain or white balance, as real captures have them. affine: a
+    colour matrix and offset a view, in linear light; bilateral: a grid of them a view, smoothed by `exposure_tv`.
 
     Ratio: until `ratio_until` of the run the colour target is the frame times the ratio of the texture at one of
     `ratio_instants` instants (a random one a step) to the exposure's mean.
@@ -91,6 +126,15 @@ class FitConfig:
     densify: str = "off"
     densify_every: int = 100
     densify_until: float = 0.7
+    densify_from: float = 0.05
+    densify_by: str = "all"
+    densify_grad: float = 0.0
+    densify_size: float = 0.01
+    densify_share: float = 1.0
+    splats_most: int = 0
+    huge: float = 0.1
+    absgrad: bool = False
+    opacity_reset: int = 3000
     noise: float = 5e4
     opacity_reg: float = 0.0
     scale_reg: float = 0.0
@@ -105,6 +149,7 @@ class FitConfig:
     finest: int = 512
     table_log2: int = 16
     occupancy: int = 64
+    probes: int = 32
     # rates
     lr_means: float = 4e-4
     lr_scales: float = 3e-2
@@ -112,6 +157,7 @@ class FitConfig:
     lr_opacities: float = 3e-2
     lr_colours: float = 1e-2
     lr_gray: float = 1e-3
+    lr_exposure: float = 2e-3
     lr_net: float = 5e-4
     lr_grid: float = 1e-2
     lr_end: float = 0.3
@@ -123,8 +169,21 @@ class FitConfig:
     fresh_poses: int = 0
     pose_label: str = "mid"
     instants_rule: str = "midpoints"
+    exposure: str = "off"
+    exposure_tv: float = 10.0
+    # paths
+    trajectory: str = "given"
+    knots: int = 0
+    knots_at: str = "even"
+    path_from: str = "given"
+    anchor: str = "mean"
+    lr_poses: float = 1e-3
+    lr_poses_end: float = 0.01
+    pose_noise_deg: float = 0.0
+    pose_noise_share: float = 0.0
     # TfS
     tfs_weight: float = 0.0
+    tfs_from: float = 0.0
     weight_reading: str = "mean"
     textures_per_view: int = 1
     textures: str = "both"
@@ -177,7 +236,10 @@ class FitConfig:
         return [
             *((getattr(self, name) < 1, f"{name} must be at least 1") for name in (*positive, "ratio_instants")),
             *((not 0 <= getattr(self, name) < 1e6, f"{name} must be 0 or more") for name in rates),
-            *((not 0 <= getattr(self, n) < 1e12, f"{n} must be 0 or more") for n in ("noise", "tfs_weight", "seconds")),
+            *(
+                (not 0 <= getattr(self, n) < 1e12, f"{n} must be 0 or more")
+                for n in ("noise", "tfs_weight", "seconds", "densify_grad", "exposure_tv")
+            ),
             (not 0 <= self.sh_degree <= 3, "sh_degree must be 0 to 3"),
             (self.fresh_poses < 0, "fresh_poses must be 0 (all) or more"),
             (not 0 < self.init_opacity < 1, "init_opacity must lie between 0 and 1"),
@@ -186,13 +248,36 @@ class FitConfig:
             (not 0 < self.lr_end <= 1, "lr_end must be in (0, 1]"),
             *(
                 (not 0 <= getattr(self, n) <= 1, f"{n} is a fraction, 0 to 1")
-                for n in ("ratio_until", "sh_warmup", "densify_until")
+                for n in ("ratio_until", "sh_warmup", "densify_until", "densify_from", "tfs_from")
             ),
             (self.ratio_eps <= 0, "ratio_eps must be positive"),
             (not 0 < self.ratio_min <= 1 <= self.ratio_max, "ratio_min <= 1 <= ratio_max must hold"),
+            *self._growth_faults(),
             *self._ray_faults(),
+            (
+                self.exposure != "off" and self.colour_target == "truth",
+                "the sharp truth has no exposure of its own to correct: exposure must be off",
+            ),
+            (
+                self.exposure == "bilateral" and self.field != "splat",
+                "a bilateral grid needs whole pictures (field splat): exposure affine corrects rays too",
+            ),
+            *self._path_faults(),
             *self._baseline_faults(),
             (self.pose_label == "first" and self.colour_target == "truth", "the truth is not labelled by pose_label"),
+        ]
+
+    def _growth_faults(self) -> list[tuple[bool, str]]:
+        default = self.densify == "default"
+        return [
+            (self.absgrad and not default, "absgrad is what densify default watches"),
+            (self.absgrad and self.device == "cuda", "absgrad is of the native rasteriser: device must be cpu"),
+            (self.densify_by != "all" and not default, "densify_by is of densify default"),
+            (self.densify_by == "tfs" and self.tfs_weight == 0, "densify_by tfs needs a TfS term"),
+            (0 < self.splats_most < self.splats, "splats_most must be 0 or at least splats"),
+            (not 0 < self.densify_share <= 1, "densify_share must be in (0, 1]"),
+            (not (self.densify_size > 0 and self.huge > 0), "densify_size and huge must be positive"),
+            (self.opacity_reset < 0, "opacity_reset must be 0 (none) or more steps"),
         ]
 
     def _ray_faults(self) -> list[tuple[bool, str]]:
@@ -205,8 +290,27 @@ class FitConfig:
             (self.views_per_step > self.rays, "views_per_step must not exceed rays"),
             (max(self.coarse, self.fine, self.width) > 4096, "coarse, fine and width are at most 4096"),
             (self.rays > 1 << 20, "rays is at most 2^20"),
+            (not 0 <= self.probes <= 4096, "probes must be 0 to 4096"),
             (not 4 <= self.occupancy <= 512, "occupancy must be 4 to 512"),
         ]
+
+    def _path_faults(self) -> list[tuple[bool, str]]:
+        least = 4 if self.trajectory == "cubic" else 2
+        still = self.trajectory == "given" and (self.path_from == "mid" or self.knots != 0 or self.knots_at != "even")
+        return [
+            (self.knots != 0 and not least <= self.knots <= 64, f"knots must be 0 or {least} to 64"),
+            (self.knots != 0 and self.knots_at == "spikes", "the spikes say how many knots there are: knots must be 0"),
+            (self.moves_cameras and self.colour_target == "truth", "the truth is seen from its true poses, which hold"),
+            (still, "knots, knots_at and path_from belong to trajectory=linear or cubic"),
+            (not 0 < self.lr_poses_end <= 1, "lr_poses_end must be in (0, 1]"),
+            (not 0 <= self.pose_noise_deg <= 90, "pose_noise_deg must be 0 to 90"),
+            (not 0 <= self.pose_noise_share <= 1, "pose_noise_share must be 0 to 1"),
+        ]
+
+    @property
+    def moves_cameras(self) -> bool:
+        """Whether training cameras are not those of the scene."""
+        return self.trajectory != "given" or self.pose_noise_deg > 0 or self.pose_noise_share > 0
 
     def _baseline_faults(self) -> list[tuple[bool, str]]:
         numbers = ("event_weight", "event_shift", "event_hinge", "event_pos", "event_neg", "kernel_align")
@@ -254,7 +358,9 @@ class FitConfig:
 
     @property
     def needs_trajectory(self) -> bool:
-        """Whether any instant but mid-exposure is rendered."""
+        """Whether any instant but mid-exposure is rendered, from a pose that must be given."""
+        if self.trajectory != "given":
+            return False
         many = self.poses_per_view > 1 and self.ratio_until < 1
         textures = self.tfs_weight > 0 and self.textures_per_view > 1
         ratio = self.ratio_until > 0 and self.ratio_instants > 1

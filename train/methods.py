@@ -61,6 +61,14 @@ def average(config: FitConfig) -> FitConfig:
     return replace(config, method="average", poses_per_view=5, fresh_poses=1)
 
 
+def bad(config: FitConfig) -> FitConfig:
+    """BAD-NeRF and BAD-Gaussians: blurry RGB explained by a linear path of 10 sub-poses found from the mid pose alone.
+
+    Source: Wang et al. 2023, Zhao et al. 2024: L1 + 0.2 D-SSIM for splats, L2 for rays; rate 1e-3 to 1e-5.
+    """
+    return replace(config, method="bad", poses_per_view=10, trajectory="linear", path_from="mid")
+
+
 def spikenerf(config: FitConfig) -> FitConfig:
     """The paper's TfS loss, 1x: one pose, one texture; L2 colour, as an L1 would keep pulling to the blur."""
     return replace(config, method="spikenerf", colour_loss="l2", tfs_weight=20.0)
@@ -134,6 +142,7 @@ def d2net(config: FitConfig) -> FitConfig:
 METHODS: dict[str, Callable[[FitConfig], FitConfig]] = {
     "plain": plain,
     "average": average,
+    "bad": bad,
     "spikenerf": spikenerf,
     "spikenerf-5x": spikenerf_5x,
     "spike-ratio": spike_ratio,
@@ -163,7 +172,7 @@ def configure(method: str = "plain", preset: str = "standard", field: str = "spl
     known = {f.name for f in fields(FitConfig)}
     if strange := sorted(set(changes) - known):
         raise UsageError("no such setting", value=", ".join(strange), expected=", ".join(sorted(known)))
-    other = {"splat": RAYS_ONLY, "nerf": SPLAT_ONLY | FAST_ONLY | {"sh_degree"}, "nerf-fast": SPLAT_ONLY}[field]
+    other = {"splat": RAYS_ONLY, "nerf": SPLAT_ONLY | FAST_ONLY | {"sh_degree", "init"}, "nerf-fast": SPLAT_ONLY}[field]
     if strange := sorted(set(changes) & other):
         raise UsageError(
             f"field {field} has no use for these settings", value=", ".join(strange), next="leave them out"

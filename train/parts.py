@@ -31,6 +31,7 @@ class Part:
 
     Args:
         name: its parameters are called `name:...` in State.params and checkpoints.
+        remark: told with every fit and kept in run.json.
         instants: config -> fractions of the exposure that are rendered beside those of colour and textures.
         read: (scene, view, config) -> pictures [H,W,...] by name, kept as TrainView.beside (of a batch of pixels, the
             values there).
@@ -43,6 +44,7 @@ class Part:
     """
 
     name: str
+    remark: str = ""
     instants: Callable[[FitConfig], tuple[float, ...]] | None = None
     read: Callable[[SceneFile, View, FitConfig], dict[str, Tensor]] | None = None
     start: Callable[[Any], Tensors] | None = None
@@ -55,7 +57,15 @@ class Part:
 
 def parts_of(config: FitConfig) -> tuple[Part, ...]:
     """The parts that a config asks for, in the order in which they act."""
-    found: list[Part] = []
+    found: list[Any] = []  # Any: a module that is checked by its file name has a Part of its own
+    if config.exposure != "off":
+        from spikerig.train.exposure import AFFINE, BILATERAL
+
+        found.append(AFFINE if config.exposure == "affine" else BILATERAL)
+    if config.trajectory != "given":
+        from spikerig.train.path import PART as PATH
+
+        found.append(PATH)
     if config.event_weight > 0:
         from spikerig.train.eventloss import EVENTS
 
