@@ -67,7 +67,7 @@ ROWS = [
     (
         "a read-out of nearly an exposure",
         "row_poses, poses_at",
-        "each pixel's own pose within 5e-6",
+        "each pixel's own pose within 5e-5",
         ROLLING + "every_pixel_has_the_pose_of_its_own_instant",
     ),
     (

@@ -15,7 +15,7 @@ from spikerig.dataset.spikes import SpikeStream
 from spikerig.dataset.texture import Texture
 from spikerig.train.trajectory import sub_pose
 
-KNOTS = 33  # poses over the read-out; straight between them is exact to float32 for any hand's shake
+KNOTS = 33  # poses over the read-out; straight between them, which is thousandths of a pixel off at most
 SAME_TICKS = 4.0  # pixels read within so many ticks of each other share a texture
 
 
