@@ -50,7 +50,7 @@ SPLAT_ONLY = {
     "opacity_reg", "scale_reg", "sh_warmup", "ssim_weight", "fresh_poses", "lr_means", "lr_scales", "lr_quats",
     "lr_opacities", "lr_colours",
 }  # fmt: skip
-FAST_ONLY = {"grid_levels", "coarsest", "finest", "table_log2", "occupancy", "probes", "lr_grid"}
+FAST_ONLY = {"grid_levels", "coarsest", "finest", "table_log2", "occupancy", "probes", "contract", "lr_grid"}
 RAYS_ONLY = {"rays", "views_per_step", "coarse", "fine", "width", "lr_net", *FAST_ONLY}
 
 
@@ -75,7 +75,8 @@ class FitConfig:
     and those the networks are trained at; with `probes` > 0 the density of so many places, looked up without gradient,
     says where those are. nerf-fast starts from the scene's points, or with `init` random from nothing. `width` is that
     of the hidden layers; `grid_levels` levels of a hash grid go from `coarsest` to `finest` cells along an axis with at
-    most 2^`table_log2` rows each; `occupancy` cells along an axis.
+    most 2^`table_log2` rows each; `occupancy` cells along an axis. `contract`: the space beyond
+    the unit ball is drawn in to radius 2 and looked at out to infinity; without, a box around all points and cameras.
 
     Camera: a blurry frame is explained by `poses_per_view` sub-poses of its exposure, averaged in linear light. One
     sub-pose is the instant of `pose_label` (the paper does not say which). More lie at (j+1/2)/n of the exposure
@@ -165,6 +166,7 @@ class FitConfig:
     table_log2: int = 16
     occupancy: int = 64
     probes: int = 32
+    contract: bool = False
     # rates
     lr_means: float = 4e-4
     lr_scales: float = 3e-2

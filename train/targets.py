@@ -189,7 +189,7 @@ def _remarks(raw: list[dict[str, Any]]) -> tuple[str, ...]:
         return (told + "every row has its own instant (poses, textures)",)
     return (
         told + "every row is treated as read when the middle one was (poses, textures), so fast shake skews; fields "
-        "nerf and nerf-fast follow the rows where the poses over the exposure are known",
+        "nerf and nerf-fast follow the rows where poses over the whole read-out are known",
     )
 
 
