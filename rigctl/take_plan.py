@@ -16,7 +16,7 @@ from spikerig.dataset.wire import WireProfile
 from spikerig.rigctl.led_view import LedPlan
 from spikerig.rigctl.panel_view import PanelPlan
 from spikerig.rigctl.profiles import DEFAULT, profile_named, profile_of
-from spikerig.rigctl.recorder import OnFull, RecorderOptions
+from spikerig.rigctl.recorder_options import OnFull, RecorderOptions
 from spikerig.rigctl.sim.limits import Faults, limits, read_record
 
 NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,62}")
@@ -108,13 +108,14 @@ class Keeping:
     segment_mb: float = limits(1074.0, 1, 1_000_000, "MB")
     sync_s: float = limits(1.0, 0, 60, "s")
     direct: bool = limits(True)
+    watch: bool = limits(True)
 
     def options(self) -> RecorderOptions:
         """What the recorder takes."""
         full: OnFull = "stop" if self.on_full == "stop" else "drop" if self.on_full == "drop" else "wait"
         return RecorderOptions(
             self.ring_s, round(self.memory_mb * 1e6), full, round(self.segment_mb * 1e6) // PAGE * PAGE, self.sync_s,
-            self.direct,
+            self.direct, self.watch,
         )  # fmt: skip
 
 

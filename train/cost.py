@@ -26,7 +26,7 @@ WEIGHTS = (0.0, 0.1, 1.0, 5.0, 20.0, 100.0, 1000.0)
 
 def plan(steps: int) -> Iterator[tuple[str, Any, Any]]:
     """Every run of the sweep: (series, knob value, config)."""
-    from spikerig.train.config import configure
+    from spikerig.train.methods import configure
 
     for method in ("plain", "average", "spikenerf", "spike-ratio", "spike-hybrid", "oracle"):
         for n in STEPS:

@@ -28,8 +28,8 @@ def step_cost(scene: Path, *, splats: int, steps: int) -> list[dict[str, Any]]:
         Rows: row, cpu_seconds, wall_seconds, over_w0 (CPU against spikenerf with w = 0), splats, size.
     """
     from spikerig.dataset.store import open_scene
-    from spikerig.train.config import configure
     from spikerig.train.fit import new_state, one_step, torch_threads
+    from spikerig.train.methods import configure
     from spikerig.train.run import prepare
 
     one = configure("spikenerf", "draft", splats=splats)

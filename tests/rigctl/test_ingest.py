@@ -20,10 +20,11 @@ from spikerig.dataset.segments import Chunk, scan
 from spikerig.dataset.store import open_scene, verify_scene
 from spikerig.rigctl.ingest import IngestConfig, ingest
 from spikerig.rigctl.ingest_sights import panel_in_view, panel_pairs, sights
-from spikerig.rigctl.ingest_slips import MendedBytes, find_slips
+from spikerig.rigctl.ingest_slips import MendedBytes
 from spikerig.rigctl.ingest_times import Framing, Times, clip_number, read_truth
 from spikerig.rigctl.ingest_truth import TrueWorld
 from spikerig.rigctl.profiles import PROFILES
+from spikerig.rigctl.slips import find_slips
 
 
 @pytest.fixture(scope="module")
@@ -247,7 +248,8 @@ def test_a_loss_that_time_cannot_see_becomes_lost_ticks(taken: Path, tmp_path: P
     view = open_take(taken).views()[1]
     calm_s = (view.clip["start_ns"][1] + 75_000_000) / 1e9 - 1000.0  # within its spikes
     folder = tmp_path / "take"
-    take(folder, plan_of(test_every=3), spike={"faults": [{"kind": "drop", "at_s": calm_s, "bytes": lost}]})
+    plan = plan_of(test_every=3, recorder={"watch": False})  # else it is taken again: test_record_slips.py
+    take(folder, plan, spike={"faults": [{"kind": "drop", "at_s": calm_s, "bytes": lost}]})
     assert verify_take(folder)[0] == []  # time told nothing
     (hole,) = [x for x in json.loads((folder / "truth.json").read_text())[0]["spike"][0]["lost"] if x["why"] == "drop"]
     told = ingest(folder, tmp_path / "s.h5")
@@ -317,7 +319,7 @@ def test_a_loss_of_whole_rows_is_told_where_the_picture_has_edges(kind: str, los
     def read(epoch: int, start: int, stop: int) -> tuple[np.ndarray, list[tuple[int, int]]]:
         return came[start:stop], [] if stop <= len(came) else [(len(came), stop)]
 
-    wire = SimpleNamespace(take=SimpleNamespace(profile=profile), read=read)
+    wire = SimpleNamespace(profile=profile, read=read)
     found = find_slips(wire, [(0, 0, len(came))])  # type: ignore[arg-type]
     assert [s.lost for s in found] == [lost] * sure
     assert all(s.after <= cut <= s.before for s in found)
