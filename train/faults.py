@@ -23,7 +23,7 @@ def _range_faults(config: FitConfig) -> list[tuple[bool, str]]:
         *((not 0 <= getattr(config, name) < 1e6, f"{name} must be 0 or more") for name in rates),
         *(
             (not 0 <= getattr(config, n) < 1e12, f"{n} must be 0 or more")
-            for n in ("noise", "tfs_weight", "seconds", "densify_grad", "exposure_tv")
+            for n in ("noise", "tfs_weight", "seconds", "densify_grad", "exposure_tv", "colour_weight")
         ),
         (not 0 <= config.sh_degree <= 3, "sh_degree must be 0 to 3"),
         (config.fresh_poses < 0, "fresh_poses must be 0 (all) or more"),
@@ -50,6 +50,8 @@ def _range_faults(config: FitConfig) -> list[tuple[bool, str]]:
         ),
         *_path_faults(config),
         *_baseline_faults(config),
+        (config.colour_weight == 0 and config.tfs_weight == 0, "without frames and textures there is nothing to fit"),
+        (config.colour_weight == 0 and config.ratio_until > 0, "a ratio target needs frames: colour_weight above 0"),
         (config.pose_label == "first" and config.colour_target == "truth", "the truth is not labelled by pose_label"),
     ]
 
