@@ -36,7 +36,8 @@ PAPER = {
 }
 ASKING = ("mpr", "d2net")  # methods that run only with a file of the user's: not among the default rows
 OWN_FLAGS = ("-o", "--out", "--method", "--field", "--preset", "--steps", "--seconds", "--seed", "--pose-label",
-             "--threads", "--resume", "--force", "--json", "--checkpoint-every", "--eval-every", "--ply")  # fmt: skip
+             "--threads", "--resume", "--force", "--json", "--score-on")  # fmt: skip
+CHECKPOINT_S = 15.0  # of a fit that is killed, at most so much is lost
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,6 +276,7 @@ def _cell(order: Order, scene: Place, row: Row, seed: int, config: FitConfig) ->
     changes = settings_of(order, scene.name, row.method)
     fit = ["train", "fit", str(scene.path), "--method", row.method, "--field", order.field, "--preset", order.preset]
     fit += ["--seed", str(seed), *(["--pose-label", config.pose_label] if config.pose_label != "mid" else [])]
+    fit += ["--checkpoint-every", f"{CHECKPOINT_S:g}"]
     for name, value in changes.items():
         flag = [f"--{name}", f"{value:g}"] if name in ("steps", "seconds") else ["--set", f"{name}={_text(value)}"]
         fit += flag
