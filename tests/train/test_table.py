@@ -367,6 +367,8 @@ def test_the_pose_label_makes_a_row_only_where_it_enters(tiny):
     assert [row.name for row in laid.rows] == ["plain@mid", "plain@first", "average", "oracle"]
     assert not label_enters(configure("spike-hybrid", "draft"))
     assert not label_enters(configure("spikenerf-5x", "draft"))
+    assert not label_enters(configure("ours", "draft"))
+    assert label_enters(configure("edi", "draft"))
     assert label_enters(configure("spikenerf-5x", "draft", textures_per_view=1))
     by_name = {cell.row.name: cell.identity["config"]["pose_label"] for cell in laid.cells}
     assert (by_name["plain@mid"], by_name["plain@first"]) == ("mid", "first")
