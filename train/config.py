@@ -34,6 +34,11 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "knots_at": ("even", "spikes"),
     "path_from": ("given", "mid"),
     "anchor": ("mean", "mid", "none"),
+    "align_arms": ("off", "shift", "affine"),
+    "restore_colour": ("model", "frame"),
+    "restore_light": ("interval", "instant"),
+    "restore_gain": ("bayes", "full"),
+    "restore_white": ("flat", "ratio"),
     "weight_reading": ("mean", "sum-batch", "sum-image", "u8"),
     "device": ("cpu", "cuda"),
 }
@@ -45,7 +50,7 @@ SPLAT_ONLY = {
     "opacity_reg", "scale_reg", "sh_warmup", "ssim_weight", "fresh_poses", "lr_means", "lr_scales", "lr_quats",
     "lr_opacities", "lr_colours",
 }  # fmt: skip
-FAST_ONLY = {"grid_levels", "coarsest", "finest", "table_log2", "occupancy", "probes", "lr_grid"}
+FAST_ONLY = {"grid_levels", "coarsest", "finest", "table_log2", "occupancy", "probes", "contract", "lr_grid"}
 RAYS_ONLY = {"rays", "views_per_step", "coarse", "fine", "width", "lr_net", *FAST_ONLY}
 
 
@@ -70,7 +75,8 @@ class FitConfig:
     and those the networks are trained at; with `probes` > 0 the density of so many places, looked up without gradient,
     says where those are. nerf-fast starts from the scene's points, or with `init` random from nothing. `width` is that
     of the hidden layers; `grid_levels` levels of a hash grid go from `coarsest` to `finest` cells along an axis with at
-    most 2^`table_log2` rows each; `occupancy` cells along an axis.
+    most 2^`table_log2` rows each; `occupancy` cells along an axis. `contract`: the space beyond
+    the unit ball is drawn in to radius 2 and looked at out to infinity; without, a box around all points and cameras.
 
     Camera: a blurry frame is explained by `poses_per_view` sub-poses of its exposure, averaged in linear light. One
     sub-pose is the instant of `pose_label` (the paper does not say which). More lie at (j+1/2)/n of the exposure
@@ -105,6 +111,16 @@ class FitConfig:
 
     Ratio: until `ratio_until` of the run the colour target is the frame times the ratio of the texture at one of
     `ratio_instants` instants (a random one a step) to the exposure's mean.
+
+    Ours (train/restore.py): with `restore_instants` n > 0 each of n instants has a target made of the model's own
+    renders, in place of the colour term; fields of rays render all n a step. `restore_colour`: the target's colour is
+    the frame's, or from `restore_from` of the run on the model's, times what its own blur lacks to be the frame.
+    `restore_light`: an interval between spikes is compared with the renders it covers, or with its instant's.
+    `restore_gain`: spikes correct the gray fully, or by what they are worth against what the model knows (bayes).
+    `restore_white`: what a spike means comes from the frame's own gray (ratio), or from a flat field that all views
+    give. `texture_window` bounds the intervals; with `highlights` keep, light above white is trained from spikes, and
+    channels that clip only say "at least". `align_arms` (any method with spikes, train/arms.py): frames are first moved
+    onto the spikes by the shift or affine motion that all views together show.
     """
 
     field: str = "splat"
@@ -150,6 +166,7 @@ class FitConfig:
     table_log2: int = 16
     occupancy: int = 64
     probes: int = 32
+    contract: bool = False
     # rates
     lr_means: float = 4e-4
     lr_scales: float = 3e-2
@@ -218,143 +235,36 @@ class FitConfig:
     restorer_bins: int = 0
     restorer_pad: int = 8
     restorer_limit_s: float = 600.0
+    # ours
+    align_arms: str = "off"
+    restore_instants: int = 0
+    restore_colour: str = "model"
+    restore_from: float = 0.1
+    restore_light: str = "interval"
+    restore_gain: str = "bayes"
+    restore_white: str = "flat"
 
     def __post_init__(self) -> None:
+        from spikerig.train.faults import faults_of
+
         faults = [
             f"{name} is '{getattr(self, name)}', not one of {', '.join(choices)}"
             for name, choices in CHOICES.items()
             if getattr(self, name) not in choices
         ]
-        faults += [text for wrong, text in self._range_faults() if wrong]
+        faults += faults_of(self)
         if faults:
             raise UsageError("the settings of this fit do not hold together", value="; ".join(faults))
-
-    def _range_faults(self) -> list[tuple[bool, str]]:
-        positive = ("steps", "splats", "densify_every", "poses_per_view", "textures_per_view", "texture_window")
-        positive += ("rays", "views_per_step", "coarse", "fine", "width")
-        rates = [f.name for f in fields(self) if f.name.startswith("lr_")]
-        return [
-            *((getattr(self, name) < 1, f"{name} must be at least 1") for name in (*positive, "ratio_instants")),
-            *((not 0 <= getattr(self, name) < 1e6, f"{name} must be 0 or more") for name in rates),
-            *(
-                (not 0 <= getattr(self, n) < 1e12, f"{n} must be 0 or more")
-                for n in ("noise", "tfs_weight", "seconds", "densify_grad", "exposure_tv")
-            ),
-            (not 0 <= self.sh_degree <= 3, "sh_degree must be 0 to 3"),
-            (self.fresh_poses < 0, "fresh_poses must be 0 (all) or more"),
-            (not 0 < self.init_opacity < 1, "init_opacity must lie between 0 and 1"),
-            (not 0 < self.init_scale < 1e3, "init_scale must be positive"),
-            (not 0 <= self.ssim_weight <= 1, "ssim_weight must be 0 to 1"),
-            (not 0 < self.lr_end <= 1, "lr_end must be in (0, 1]"),
-            *(
-                (not 0 <= getattr(self, n) <= 1, f"{n} is a fraction, 0 to 1")
-                for n in ("ratio_until", "sh_warmup", "densify_until", "densify_from", "tfs_from")
-            ),
-            (self.ratio_eps <= 0, "ratio_eps must be positive"),
-            (not 0 < self.ratio_min <= 1 <= self.ratio_max, "ratio_min <= 1 <= ratio_max must hold"),
-            *self._growth_faults(),
-            *self._ray_faults(),
-            (
-                self.exposure != "off" and self.colour_target == "truth",
-                "the sharp truth has no exposure of its own to correct: exposure must be off",
-            ),
-            (
-                self.exposure == "bilateral" and self.field != "splat",
-                "a bilateral grid needs whole pictures (field splat): exposure affine corrects rays too",
-            ),
-            *self._path_faults(),
-            *self._baseline_faults(),
-            (self.pose_label == "first" and self.colour_target == "truth", "the truth is not labelled by pose_label"),
-        ]
-
-    def _growth_faults(self) -> list[tuple[bool, str]]:
-        default = self.densify == "default"
-        return [
-            (self.absgrad and not default, "absgrad is what densify default watches"),
-            (self.absgrad and self.device == "cuda", "absgrad is of the native rasteriser: device must be cpu"),
-            (self.densify_by != "all" and not default, "densify_by is of densify default"),
-            (self.densify_by == "tfs" and self.tfs_weight == 0, "densify_by tfs needs a TfS term"),
-            (0 < self.splats_most < self.splats, "splats_most must be 0 or at least splats"),
-            (not 0 < self.densify_share <= 1, "densify_share must be in (0, 1]"),
-            (not (self.densify_size > 0 and self.huge > 0), "densify_size and huge must be positive"),
-            (self.opacity_reset < 0, "opacity_reset must be 0 (none) or more steps"),
-        ]
-
-    def _ray_faults(self) -> list[tuple[bool, str]]:
-        if self.field == "splat":
-            return []
-        return [
-            (self.colour_loss != "l2", "a batch of rays has no neighbours for SSIM: colour_loss must be l2"),
-            (self.fresh_poses > 0, "renders of single rays are not remembered: fresh_poses must be 0"),
-            (self.densify != "off", "only splats densify"),
-            (self.views_per_step > self.rays, "views_per_step must not exceed rays"),
-            (max(self.coarse, self.fine, self.width) > 4096, "coarse, fine and width are at most 4096"),
-            (self.rays > 1 << 20, "rays is at most 2^20"),
-            (not 0 <= self.probes <= 4096, "probes must be 0 to 4096"),
-            (not 4 <= self.occupancy <= 512, "occupancy must be 4 to 512"),
-        ]
-
-    def _path_faults(self) -> list[tuple[bool, str]]:
-        least = 4 if self.trajectory == "cubic" else 2
-        still = self.trajectory == "given" and (self.path_from == "mid" or self.knots != 0 or self.knots_at != "even")
-        return [
-            (self.knots != 0 and not least <= self.knots <= 64, f"knots must be 0 or {least} to 64"),
-            (self.knots != 0 and self.knots_at == "spikes", "the spikes say how many knots there are: knots must be 0"),
-            (self.moves_cameras and self.colour_target == "truth", "the truth is seen from its true poses, which hold"),
-            (still, "knots, knots_at and path_from belong to trajectory=linear or cubic"),
-            (not 0 < self.lr_poses_end <= 1, "lr_poses_end must be in (0, 1]"),
-            (not 0 <= self.pose_noise_deg <= 90, "pose_noise_deg must be 0 to 90"),
-            (not 0 <= self.pose_noise_share <= 1, "pose_noise_share must be 0 to 1"),
-        ]
 
     @property
     def moves_cameras(self) -> bool:
         """Whether training cameras are not those of the scene."""
         return self.trajectory != "given" or self.pose_noise_deg > 0 or self.pose_noise_share > 0
 
-    def _baseline_faults(self) -> list[tuple[bool, str]]:
-        numbers = ("event_weight", "event_shift", "event_hinge", "event_pos", "event_neg", "kernel_align")
-        edi_at_mid = self.colour_target == "edi" and self.edi_form == "binned" and self.pose_label == "mid"
-        return [
-            *((not 0 <= getattr(self, n) < 1e3, f"{n} must be 0 to 1000") for n in numbers),
-            ((self.event_pos > 0) != (self.event_neg > 0), "event_pos and event_neg are given both or not at all"),
-            (
-                self.average_domain == "encoded" and self.fresh_poses > 0,
-                "fresh_poses remembers linear light: use linear",
-            ),
-            (
-                self.event_weight > 0 and self.poses_per_view < 2,
-                "events tie two sub-poses: poses_per_view must be 2 or more",
-            ),
-            (
-                self.event_weight > 0 and self.instants_rule != "endpoints",
-                "events lie between endpoints: instants_rule",
-            ),
-            (
-                self.event_weight > 0 and self.fresh_poses == 1,
-                "events tie two renders of a step: fresh_poses must not be 1",
-            ),
-            (not 1 <= self.edi_bins <= 1000, "edi_bins must be 1 to 1000"),
-            (edi_at_mid and self.edi_bins % 2 == 1, "mid-exposure is the end of a bin only for even edi_bins"),
-            (not 0 <= self.kernel_points <= 64, "kernel_points must be 0 (no kernel) to 64"),
-            (not 0 <= self.kernel_start <= 1, "kernel_start is a fraction, 0 to 1"),
-            (
-                self.kernel_points > 0 and self.poses_per_view > 1,
-                "a kernel stands for the sub-poses: poses_per_view must be 1",
-            ),
-            (
-                not 1 <= self.restorer_frames <= 99 or self.restorer_frames % 2 == 0,
-                "restorer_frames must be odd, 1 to 99",
-            ),
-            (not 0 <= self.restorer_bins <= 100, "restorer_bins must be 0 (no events) to 100"),
-            (not 1 <= self.restorer_pad <= 256, "restorer_pad must be 1 to 256"),
-            (not 0 < self.restorer_limit_s <= 1e6, "restorer_limit_s must be positive"),
-        ]
-
     @property
     def needs_spikes(self) -> bool:
         """Whether any term reads spikes."""
-        return self.tfs_weight > 0 or self.ratio_until > 0
+        return self.tfs_weight > 0 or self.ratio_until > 0 or self.restore_instants > 0
 
     @property
     def needs_trajectory(self) -> bool:
@@ -364,7 +274,7 @@ class FitConfig:
         many = self.poses_per_view > 1 and self.ratio_until < 1
         textures = self.tfs_weight > 0 and self.textures_per_view > 1
         ratio = self.ratio_until > 0 and self.ratio_instants > 1
-        return many or textures or ratio or self.pose_label == "first"
+        return many or textures or ratio or self.restore_instants > 1 or self.pose_label == "first"
 
     def as_json(self) -> dict[str, Any]:
         """A JSON-ready record of every setting."""
