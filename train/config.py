@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from spikerig.dataset.errors import UsageError
+from spikerig.train.baseline_settings import baseline_faults
 
 CHOICES: dict[str, tuple[str, ...]] = {
     "field": ("splat", "nerf", "nerf-fast"),
@@ -105,6 +106,15 @@ class FitConfig:
 
     Ratio: until `ratio_until` of the run the colour target is the frame times the ratio of the texture at one of
     `ratio_instants` instants (a random one a step) to the exposure's mean.
+
+    Baselines (docs/baselines.md): `colour_target` frame, truth, edi (frames deblurred by events: `edi_form` continuous,
+    or binned in `edi_bins`) or restored (by the network `restorer`, which runs only with `trust`; it sees
+    `restorer_frames` views and `restorer_bins` event sums of each, sides padded to multiples of `restorer_pad`, and has
+    `restorer_limit_s` for all). `average_domain`: sub-poses and kernels are averaged as linear light or as encoded
+    codes. `event_weight` of E2NeRF's loss (renders at bin ends against events); `event_light` is what it takes the log
+    of; `event_pos` and `event_neg` are thresholds (0: those recorded); `event_shift` is added to counts, `event_hinge`
+    weighs pixels without events. `kernel_points` of Deblur-NeRF's kernel, from `kernel_start` of the run on, its first
+    point held by `kernel_align`.
     """
 
     field: str = "splat"
@@ -263,7 +273,7 @@ class FitConfig:
                 "a bilateral grid needs whole pictures (field splat): exposure affine corrects rays too",
             ),
             *self._path_faults(),
-            *self._baseline_faults(),
+            *baseline_faults(self),
             (self.pose_label == "first" and self.colour_target == "truth", "the truth is not labelled by pose_label"),
         ]
 
@@ -311,45 +321,6 @@ class FitConfig:
     def moves_cameras(self) -> bool:
         """Whether training cameras are not those of the scene."""
         return self.trajectory != "given" or self.pose_noise_deg > 0 or self.pose_noise_share > 0
-
-    def _baseline_faults(self) -> list[tuple[bool, str]]:
-        numbers = ("event_weight", "event_shift", "event_hinge", "event_pos", "event_neg", "kernel_align")
-        edi_at_mid = self.colour_target == "edi" and self.edi_form == "binned" and self.pose_label == "mid"
-        return [
-            *((not 0 <= getattr(self, n) < 1e3, f"{n} must be 0 to 1000") for n in numbers),
-            ((self.event_pos > 0) != (self.event_neg > 0), "event_pos and event_neg are given both or not at all"),
-            (
-                self.average_domain == "encoded" and self.fresh_poses > 0,
-                "fresh_poses remembers linear light: use linear",
-            ),
-            (
-                self.event_weight > 0 and self.poses_per_view < 2,
-                "events tie two sub-poses: poses_per_view must be 2 or more",
-            ),
-            (
-                self.event_weight > 0 and self.instants_rule != "endpoints",
-                "events lie between endpoints: instants_rule",
-            ),
-            (
-                self.event_weight > 0 and self.fresh_poses == 1,
-                "events tie two renders of a step: fresh_poses must not be 1",
-            ),
-            (not 1 <= self.edi_bins <= 1000, "edi_bins must be 1 to 1000"),
-            (edi_at_mid and self.edi_bins % 2 == 1, "mid-exposure is the end of a bin only for even edi_bins"),
-            (not 0 <= self.kernel_points <= 64, "kernel_points must be 0 (no kernel) to 64"),
-            (not 0 <= self.kernel_start <= 1, "kernel_start is a fraction, 0 to 1"),
-            (
-                self.kernel_points > 0 and self.poses_per_view > 1,
-                "a kernel stands for the sub-poses: poses_per_view must be 1",
-            ),
-            (
-                not 1 <= self.restorer_frames <= 99 or self.restorer_frames % 2 == 0,
-                "restorer_frames must be odd, 1 to 99",
-            ),
-            (not 0 <= self.restorer_bins <= 100, "restorer_bins must be 0 (no events) to 100"),
-            (not 1 <= self.restorer_pad <= 256, "restorer_pad must be 1 to 256"),
-            (not 0 < self.restorer_limit_s <= 1e6, "restorer_limit_s must be positive"),
-        ]
 
     @property
     def needs_spikes(self) -> bool:

@@ -207,3 +207,9 @@ def test_it_is_sharper_than_plain_and_the_model_knows_no_kernel(tiny, tmp_path):
 def test_settings_that_make_no_sense_are_refused(changes):
     with pytest.raises(UsageError, match="do not hold together"):
         configure("deblur", "draft", **changes)
+
+
+def test_a_field_that_cannot_learn_it_refuses_it():
+    with pytest.raises(UsageError) as caught:
+        configure("deblur", "draft", "nerf-fast")
+    assert "nerf-fast" in str(caught.value)

@@ -167,6 +167,13 @@ def test_scenes_that_do_not_fit_are_refused(tiny, tmp_path):
     refused("no event threshold", events=lambda e: no_events(40, 64, e.t0_ns, e.t1_ns), info={})
 
 
+def test_mid_exposure_must_be_the_end_of_a_bin(tiny):
+    with open_scene(tiny) as scene:
+        with pytest.raises(UsageError, match="even edi_bins"):
+            deblurred(scene, configure("edi", "draft", edi_form="binned", edi_bins=5))
+        assert deblurred(scene, configure("edi", "draft", edi_form="binned", edi_bins=5, pose_label="first"))
+
+
 def test_events_on_another_clock_are_mapped(tiny, tmp_path):
     late = 5_000_000
     clock = ClockModel(np.array([late]), np.array([0]), np.zeros(1))
