@@ -22,7 +22,7 @@ WIDE = 480  # px: larger pictures are looked at in blocks
 STEP = 1.03  # between periods that are tried
 
 
-class _Beats:
+class Beats:
     """Sums over pictures that tell how much of each pixel's light beats with each of some periods."""
 
     def __init__(self, periods_ns: Sequence[float]) -> None:
@@ -52,6 +52,32 @@ class _Beats:
         return amplitude, amplitude**2 / 2 / variance
 
 
+def spike_beats(streams: Iterable[SpikeStream], periods_ns: Sequence[float]) -> tuple[Beats, float]:
+    """Beats of a viewpoint's spikes, and how long they last, ns."""
+    beats, first, last = Beats(periods_ns), 0, 0
+    for stream in streams:
+        tick_ns = 1e9 / float(stream.rate_hz or 1)
+        first, last = (stream.t0_ns, last) if not beats.count else (first, last)
+        gone = stream.lost_before()
+        for t in range(0, stream.ticks - BIN + 1, BIN):
+            if gone[t] == gone[t + BIN]:
+                last = stream.t0_ns + round((t + BIN) * tick_ns)
+                beats.add(stream.t0_ns - first + (t + BIN / 2) * tick_ns, window_sum(stream, t, t + BIN) / BIN)
+    return beats, last - first
+
+
+def frame_beats(looks: Iterable[tuple[float, NDArray]], periods_ns: Sequence[float]) -> tuple[Beats, float, int]:
+    """Beats of a clip's frames, how long they last (ns), and how many pixels wide one of its pixels is."""
+    beats, first, last, block = Beats(periods_ns), 0.0, 0.0, 1
+    for at_ns, light in looks:
+        if not beats.count:
+            first, block = at_ns, -(-light.shape[1] // WIDE)
+        last = at_ns
+        h, w = (n // block * block for n in light.shape)
+        beats.add(at_ns - first, light[:h, :w].reshape(h // block, block, w // block, block).mean((1, 3)))
+    return beats, last - first, block
+
+
 def find_in_spikes(streams: Iterable[SpikeStream], periods_ns: Sequence[float]) -> list[Spot]:
     """The LED in a viewpoint's spikes.
 
@@ -64,16 +90,8 @@ def find_in_spikes(streams: Iterable[SpikeStream], periods_ns: Sequence[float]) 
 
     Cost: about 1 ms a 64 ticks of 400x250 and period.
     """
-    beats, first, last = _Beats(periods_ns), 0, 0
-    for stream in streams:
-        tick_ns = 1e9 / float(stream.rate_hz or 1)
-        first, last = (stream.t0_ns, last) if not beats.count else (first, last)
-        gone = stream.lost_before()
-        for t in range(0, stream.ticks - BIN + 1, BIN):
-            if gone[t] == gone[t + BIN]:
-                last = stream.t0_ns + round((t + BIN) * tick_ns)
-                beats.add(stream.t0_ns - first + (t + BIN / 2) * tick_ns, window_sum(stream, t, t + BIN) / BIN)
-    return _spots(beats, periods_ns, last - first, "spikes")
+    beats, span_ns = spike_beats(streams, periods_ns)
+    return _spots(beats, periods_ns, span_ns, "spikes")
 
 
 def find_in_frames(looks: Iterable[tuple[float, NDArray]], period_ns: float) -> list[Spot]:
@@ -86,15 +104,9 @@ def find_in_frames(looks: Iterable[tuple[float, NDArray]], period_ns: float) -> 
     Raises:
         DataError: nothing beats so.
     """
-    beats, first, last, block = _Beats([period_ns]), 0.0, 0.0, 1
-    for at_ns, light in looks:
-        if not beats.count:
-            first, block = at_ns, -(-light.shape[1] // WIDE)
-        last = at_ns
-        h, w = (n // block * block for n in light.shape)
-        beats.add(at_ns - first, light[:h, :w].reshape(h // block, block, w // block, block).mean((1, 3)))
+    beats, span_ns, block = frame_beats(looks, [period_ns])
     return [Spot(0, s.x_px * block, s.y_px * block, s.radius_px * block)
-            for s in _spots(beats, [period_ns], last - first, "frames")]  # fmt: skip
+            for s in _spots(beats, [period_ns], span_ns, "frames")]  # fmt: skip
 
 
 def periods_to_try(period_ns: float, span_ns: float) -> list[float]:
@@ -105,7 +117,7 @@ def periods_to_try(period_ns: float, span_ns: float) -> list[float]:
     return [low * STEP**k for k in range(max(int(np.log(max(high / low, 1.0)) / np.log(STEP)) + 1, 1))]
 
 
-def _spots(beats: _Beats, periods_ns: Sequence[float], span_ns: float, where: str) -> list[Spot]:
+def _spots(beats: Beats, periods_ns: Sequence[float], span_ns: float, where: str) -> list[Spot]:
     """The strongest pixel that beats as an LED does, and those around it that beat as it."""
     import cv2
 

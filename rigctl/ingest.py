@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.build import area_resize
-from spikerig.dataset.clocktime import NS, ClockModel
+from spikerig.dataset.clocktime import NS, ClockModel, tick_from_ns
 from spikerig.dataset.errors import DataError, RefusedError
 from spikerig.dataset.gopro_file import GoProClip, open_gopro
 from spikerig.dataset.gopro_pictures import read_pictures
@@ -178,6 +178,8 @@ def cut_view(
 ) -> list[Cut]:
     """The frames nearest the middle of a viewpoint whose exposures its spikes cover, with those spikes.
 
+    A frame of whose exposure no tick is left says nothing: the next one is taken.
+
     Raises:
         DataError: no clip, no such frame, or damaged files.
         RefusedError: clocks or framing cannot be told.
@@ -199,18 +201,27 @@ def cut_view(
     spike = times.spike(epoch, device_ns(profile, start))
     rig_of = _tick_times(profile, spike, offset)
     begin, end = (int(t) for t in rig_of(np.array([first, last])))
-    chosen = _frames(clip, rgb, begin, end, config, profile, spike, view.name)
-    cuts = []
-    for number, frame in read_pictures(clip, chosen):
-        starts = int(rgb.rig_from_device(frame.start_ns))
-        ends = starts + frame.exposure_ns + round(clip.row_ns * (clip.height - 1))
-        margin = _margin_ns(config, profile, spike, rgb, frame.start_ns, device_ns(profile, start))
+    likely = _frames(clip, rgb, begin, end, config, profile, spike, view.name)
+    found: dict[int, tuple[SpikeStream, float]] = {}
+    for number in likely:
+        media = int(clip.start_ns[number])
+        starts, ends = (int(t) for t in _exposed(clip, rgb, np.array([number]))[:, 0])
+        margin = _margin_ns(config, profile, spike, rgb, media, device_ns(profile, start))
         t0 = max(first, int(np.floor(_tick_at(rig_of, first, last, starts - margin))))
         t1 = min(last, int(np.ceil(_tick_at(rig_of, first, last, ends + margin))))
-        sigma = float(np.hypot(spike.sigma_at(device_ns(profile, start)), rgb.sigma_at(int(clip.start_ns[number]))))
-        rows = (np.arange(profile.height, dtype=np.float32) + 0.5) * (clip.height / profile.height) - 0.5
         spikes = _spikes(wire, epoch, offset, t0, t1, rig_of)
-        cuts.append(Cut(_sized(frame, starts, profile), rows, spikes, sigma, tied.how))
+        if not _blind(spikes, starts, ends):
+            sigma = float(np.hypot(spike.sigma_at(device_ns(profile, start)), rgb.sigma_at(media)))
+            found[number] = spikes, sigma
+        if len(found) == config.frames:
+            break
+    if not found:
+        raise DataError("every tick of its exposures is lost", value=f"{view.name}, {len(likely)} frames")
+    cuts = []
+    for number, frame in read_pictures(clip, sorted(found)):
+        rows = (np.arange(profile.height, dtype=np.float32) + 0.5) * (clip.height / profile.height) - 0.5
+        starts = int(rgb.rig_from_device(frame.start_ns))
+        cuts.append(Cut(_sized(frame, starts, profile), rows, *found[number], tied.how))
     return cuts
 
 
@@ -246,12 +257,9 @@ def _frames(
     clip: GoProClip, rgb: ClockModel, begin: int, end: int, config: IngestConfig, profile: WireProfile,
     spike: ClockModel, name: str,
 ) -> list[int]:  # fmt: skip
-    """Numbers of the frames that the spikes cover with margins, the nearest to the middle."""
-    if clip.exposure_ns is None or clip.row_ns is None:
-        return []
+    """Numbers of the frames that the spikes cover with margins, the nearest to the middle first."""
     margin = round(config.margin_ticks / profile.rate_hz * NS)
-    starts = rgb.rig_from_device(clip.start_ns)
-    ends = starts + clip.exposure_ns + round(clip.row_ns * (clip.height - 1))
+    starts, ends = _exposed(clip, rgb, np.arange(clip.frames))
     good = np.flatnonzero((starts - margin >= begin) & (ends + margin <= end))
     if not len(good):
         raise DataError(
@@ -261,7 +269,23 @@ def _frames(
             cause="too short a viewpoint, or clocks that are off",
         )  # fmt: skip
     apart = np.abs((starts + ends)[good] // 2 - (begin + end) // 2)
-    return sorted(int(k) for k in good[np.argsort(apart, kind="stable")[: config.frames]])
+    return [int(k) for k in good[np.argsort(apart, kind="stable")]]
+
+
+def _exposed(clip: GoProClip, rgb: ClockModel, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+    """When frames begin to be exposed, and when their last row ends, int64[2,N] of rig time."""
+    starts = rgb.rig_from_device(clip.start_ns[numbers])
+    exposure = np.zeros(clip.frames, np.int64) if clip.exposure_ns is None else clip.exposure_ns
+    return np.stack([starts, starts + exposure[numbers] + round((clip.row_ns or 0.0) * (clip.height - 1))])
+
+
+def _blind(spikes: SpikeStream, starts: int, ends: int) -> bool:
+    """Whether no tick between two times is left."""
+    a, b = np.clip(tick_from_ns([starts, ends], float(spikes.rate_hz or 1), spikes.t0_ns), 0, spikes.ticks)
+    gone = np.zeros(spikes.ticks, bool)
+    for m, n in spikes.lost:
+        gone[m:n] = True
+    return bool(gone[int(a) : int(np.ceil(b))].all())
 
 
 def _sized(frame: Frame, start_ns: int, profile: WireProfile) -> Frame:

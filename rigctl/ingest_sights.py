@@ -6,15 +6,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spikerig.calib.panel_find import find_panel_in_frames, find_panel_in_spikes
 from spikerig.calib.panel_frames import read_frames
 from spikerig.calib.panel_read import Spot, read_spikes
+from spikerig.dataset.clocktime import NS
 from spikerig.dataset.errors import DataError, RefusedError, UsageError
 from spikerig.dataset.marks import Mark, Sight
 from spikerig.dataset.panel import Panel
@@ -32,6 +34,7 @@ class InView:
     panel: Panel
     spike: tuple[Spot, ...]
     rgb: tuple[Spot, ...]
+    find: tuple[str, ...] = ()  # arms whose spots are to be found
 
     @property
     def pairs(self) -> list[tuple[Spot, Spot]]:
@@ -67,6 +70,39 @@ def panel_in_view(plan: Mapping[str, Any]) -> InView | None:
         told.panel, tuple(spots(told.panel, told.spike, told.spike_radius_px)),
         tuple(spots(told.panel, told.rgb, told.rgb_radius_px)),
     )  # fmt: skip
+
+
+def found_in(take: RawTake, views: Sequence[TakenView], panel: InView, wire: WireBytes, framing: Framing) -> InView:
+    """The panel with spots in every arm that asks for them, found by their blinking at the first viewpoint that tells.
+
+    Raises:
+        DataError: none tells, with what the last one said.
+    """
+    for arm in panel.find:
+        why: DataError | RefusedError | None = None
+        for view in views:
+            try:
+                spots_ = _found(take, view, arm, panel.panel, wire, framing)
+            except (DataError, RefusedError) as error:
+                why = error
+                continue
+            panel = replace(panel, spike=spots_) if arm == "spike" else replace(panel, rgb=spots_)
+            break
+        else:
+            raise why or DataError("the take has no viewpoint to find the panel in", value=take.folder)
+    return replace(panel, find=())
+
+
+def _found(
+    take: RawTake, view: TakenView, arm: str, panel: Panel, wire: WireBytes, framing: Framing
+) -> tuple[Spot, ...]:
+    if arm == "spike":
+        span = max(view.spikes, key=lambda s: s[2] - s[1])
+        length = (span[2] - span[1]) / take.profile.bytes_s * NS
+        return tuple(find_panel_in_spikes(streams(wire, framing, span), panel, length, NS / take.profile.rate_hz))
+    clip = open_clip(take, view)
+    length, frame = float(clip.start_ns[clip.frames - 1] - clip.start_ns[0]), float(np.median(np.diff(clip.start_ns)))
+    return tuple(find_panel_in_frames(((k.start_ns, k.light[:, :]) for k in looks(clip)), panel, length, frame))
 
 
 def panel_mask(take: RawTake) -> NDArray[np.bool_] | None:

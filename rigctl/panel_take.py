@@ -12,17 +12,18 @@ from spikerig.dataset.marks import MarkLog, Sight, read_marks
 from spikerig.dataset.outfile import whole_file
 from spikerig.dataset.panel import Led, Panel
 from spikerig.dataset.rawtake import open_take
-from spikerig.rigctl.ingest_sights import InView, panel_in_view, sights
+from spikerig.rigctl.ingest_sights import InView, found_in, panel_in_view, sights
 from spikerig.rigctl.ingest_slips import mended
 from spikerig.rigctl.ingest_times import Framing
 from spikerig.rigctl.view_parts import without
 
-SCHEMA = "spikerig.panel/1"
+SCHEMA, FIND = "spikerig.panel/1", "find"
 
 
 def read_spots(path: str | Path) -> InView:
     """A file of spots: {"schema": "spikerig.panel/1", "panel": {step_ns, bits, slow, leds}, "spike": [[led, x, y, r]],
-    "rgb": [...]}; `leds` ([[bit, inverted, x_mm, y_mm]]) may be left out for the usual two rows.
+    "rgb": [...]}; `leds` ([[bit, inverted, x_mm, y_mm]]) may be left out for the usual two rows. In place of an arm's
+    spots "find": by their blinking, at the first viewpoint where they are seen.
 
     Raises:
         UsageError: there is no such file.
@@ -35,13 +36,15 @@ def read_spots(path: str | Path) -> InView:
         own = dict(told["panel"])
         leds = tuple(Led(int(b), bool(i), float(x), float(y)) for b, i, x, y in own.pop("leds", ()))
         panel = Panel(**{k: int(v) for k, v in own.items()}, leds=leds)
+        wanted = {k: told[k] == FIND for k in ("spike", "rgb")}
         spots = {
-            k: tuple(Spot(int(n), float(x), float(y), float(r)) for n, x, y, r in told[k]) for k in ("spike", "rgb")
+            k: () if wanted[k] else tuple(Spot(int(n), float(x), float(y), float(r)) for n, x, y, r in told[k])
+            for k in wanted
         }
         numbers = [s.led for row in spots.values() for s in row]
-        if not numbers or min(numbers) < 0 or max(numbers) >= len(panel.leds):
+        if not any(wanted.values()) and (not numbers or min(numbers) < 0 or max(numbers) >= len(panel.leds)):
             raise ValueError("a spot names an LED that the panel does not have, or there are none")
-        return InView(panel, spots["spike"], spots["rgb"])
+        return InView(panel, spots["spike"], spots["rgb"], tuple(k for k in wanted if wanted[k]))
     except OSError as error:
         raise UsageError("the file of spots cannot be read", value=f"{path}: {error.strerror}") from error
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError, UsageError) as error:
@@ -80,6 +83,7 @@ def read_panel(folder: str | Path, view: InView | None = None, *, force: bool = 
     views = [v for v in take.views() if v.kept]
     wire, views = mended(take, views)
     framing = Framing(wire, [s for v in views for s in v.spikes], view.pairs)
+    view = found_in(take, views, view, wire, framing)
     seen, missing = sights(take, views, view, marks, wire, framing)
     if not seen:
         raise DataError("nothing in this take shows the panel", value=take.folder, cause="; ".join(missing)[:500])

@@ -15,9 +15,10 @@ from spikerig.rigctl.slips import LOOK_TICKS, SURE, narrow, settled
 Bytes = NDArray[np.uint8]
 MARGIN = LOOK_TICKS // 2  # ticks that `narrow` needs on either side of a look
 TAGS_S = 0.05  # between two looks at tags
-KEPT = 304  # ticks that are kept of what came: a look with its margins, and edges before it
+KEPT = 160  # ticks that are kept of what came: a look with its margins, and edges before it
 STEP = 128  # ticks between looks where something seems to have moved
-TESTS, EARNED = 4.0, 1 / 16  # full tests at hand at most, and earned by each look
+TESTS, EARNED = 4.0, 1 / 64  # full tests at hand at most, and earned by each look, of ticks of
+COSTLY = 12_500  # bytes; smaller ones cost less
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,13 +102,13 @@ class SlipWatch:
         looks again every 6.4 ms in between, and only where two such looks differ, too, comes the test that ingest
         makes (`slips.narrow`, `slips.settled`): the shift must come at once, within 3 ms, and one of whole rows only
         where the picture's edges moved as well. So a moving picture is no loss, and what is told here is what ingest
-        would find. Those tests are rationed (one in 16 looks, 4 in a row; shifts by whole rows, as a picture that moves
-        makes them, and others apart), or a rig that is carried about would cost a whole core; what was not tested is
-        counted, and ingest finds it. After a slip nothing is told until the next
-        epoch. Whole ticks that are lost move nothing.
+        would find. Those tests are rationed (one in 64 looks, 4 in a row, more of smaller pictures; shifts by whole
+        rows, as a picture that moves makes them, and others apart), or a rig that is carried about would cost a whole
+        core; what was not tested is counted, and ingest finds it. After a slip nothing is told until the next epoch.
+        Whole ticks that are lost move nothing.
 
     Cost:
-        At 400x250: 0.4 ms a look, 20 looks a second, and a copy of 3.8 MB; 3 ms where it looks again, 20 to 150 ms a
+        At 400x250: 0.4 ms a look, 20 looks a second, and a copy of 2 MB; 3 ms where it looks again, 20 to 150 ms a
         test.
     """
 
@@ -119,7 +120,12 @@ class SlipWatch:
         self._window = _Window(profile)
         self._seen: tuple[int, Rates] | None = None  # the last look: where, and what
         self._before: Bytes | None = None  # the last look of the epoch before
-        self._tests = [TESTS, TESTS]  # at hand: of shifts by whole rows, as of a moving picture, and of all others
+        scale = max(1.0, COSTLY / self._size)
+        self._most, self._earned = TESTS * scale, EARNED * scale
+        self._tests = [
+            self._most,
+            self._most,
+        ]  # at hand: of shifts by whole rows, as of a moving picture, and of all others
 
     def add(self, epoch: int, byte_index: int, data: Bytes) -> Slip | Refound | None:
         """Bytes of an epoch, in order; where some are left out, what lies between is not judged."""
@@ -166,22 +172,18 @@ class SlipWatch:
         (before, then), now = self._seen, byte_counts(self._at(at), self._size)
         self._seen = (at, now)
         self.looks += 1
-        self._tests = [min(TESTS, left + EARNED) for left in self._tests]
-        if not self._shift(then, now):
+        self._tests = [min(self._most, left + self._earned) for left in self._tests]
+        if not find_shift(now, then, SURE):
             return None
         self.suspicions += 1
         last, counts = before, then
         for near in [*range(before + STEP * self._size, at, STEP * self._size), at]:
             here = now if near == at else byte_counts(self._at(near), self._size)
-            shift = self._shift(counts, here)
+            shift = find_shift(here, counts, SURE)
             if shift and (slip := self._test(last, near, shift)):
                 return slip
             last, counts = near, here
         return None
-
-    def _shift(self, then: Rates, now: Rates) -> int:
-        phase = find_shift(now, then, self.profile)
-        return phase.offset if phase.confidence > SURE else 0
 
     def _test(self, before: int, at: int, shift: int) -> Slip | None:
         """The test that ingest makes, where there is one at hand."""

@@ -35,6 +35,11 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "knots_at": ("even", "spikes"),
     "path_from": ("given", "mid"),
     "anchor": ("mean", "mid", "none"),
+    "align_arms": ("off", "shift", "affine"),
+    "restore_colour": ("model", "frame"),
+    "restore_light": ("interval", "instant"),
+    "restore_gain": ("bayes", "full"),
+    "restore_white": ("flat", "ratio"),
     "weight_reading": ("mean", "sum-batch", "sum-image", "u8"),
     "device": ("cpu", "cuda"),
 }
@@ -46,7 +51,7 @@ SPLAT_ONLY = {
     "opacity_reg", "scale_reg", "sh_warmup", "ssim_weight", "fresh_poses", "lr_means", "lr_scales", "lr_quats",
     "lr_opacities", "lr_colours",
 }  # fmt: skip
-FAST_ONLY = {"grid_levels", "coarsest", "finest", "table_log2", "occupancy", "probes", "lr_grid"}
+FAST_ONLY = {"grid_levels", "coarsest", "finest", "table_log2", "occupancy", "probes", "contract", "lr_grid"}
 RAYS_ONLY = {"rays", "views_per_step", "coarse", "fine", "width", "lr_net", *FAST_ONLY}
 
 
@@ -71,7 +76,8 @@ class FitConfig:
     and those the networks are trained at; with `probes` > 0 the density of so many places, looked up without gradient,
     says where those are. nerf-fast starts from the scene's points, or with `init` random from nothing. `width` is that
     of the hidden layers; `grid_levels` levels of a hash grid go from `coarsest` to `finest` cells along an axis with at
-    most 2^`table_log2` rows each; `occupancy` cells along an axis.
+    most 2^`table_log2` rows each; `occupancy` cells along an axis. `contract`: the space beyond
+    the unit ball is drawn in to radius 2 and looked at out to infinity; without, a box around all points and cameras.
 
     Camera: a blurry frame is explained by `poses_per_view` sub-poses of its exposure, averaged in linear light. One
     sub-pose is the instant of `pose_label` (the paper does not say which). More lie at (j+1/2)/n of the exposure
@@ -106,6 +112,16 @@ class FitConfig:
 
     Ratio: until `ratio_until` of the run the colour target is the frame times the ratio of the texture at one of
     `ratio_instants` instants (a random one a step) to the exposure's mean.
+
+    Ours (train/restore.py): with `restore_instants` n > 0 each of n instants has a target made of the model's own renders,
+    in place of the colour term; fields of rays render all n a step. `restore_colour`: the target's colour is the
+    frame's, or from `restore_from` of the run on the model's, times what its own blur lacks to be the frame.
+    `restore_light`: an interval between spikes is compared with the renders it covers, or with its instant's.
+    `restore_gain`: spikes correct the gray fully, or by what they are worth against what the model knows (bayes).
+    `restore_white`: what a spike means comes from the frame's own gray (ratio), or from a flat field that all views give.
+    `texture_window` bounds the intervals; with `highlights` keep, light above white is trained from spikes, and channels
+    that clip only say "at least". `align_arms` (any method with spikes, train/arms.py): frames are first moved onto the
+    spikes by the shift or affine motion that all views together show.
 
     Baselines (docs/baselines.md): `colour_target` frame, truth, edi (frames deblurred by events: `edi_form` continuous,
     or binned in `edi_bins`) or restored (by the network `restorer`, which runs only with `trust`; it sees
@@ -160,6 +176,7 @@ class FitConfig:
     table_log2: int = 16
     occupancy: int = 64
     probes: int = 32
+    contract: bool = False
     # rates
     lr_means: float = 4e-4
     lr_scales: float = 3e-2
@@ -228,6 +245,14 @@ class FitConfig:
     restorer_bins: int = 0
     restorer_pad: int = 8
     restorer_limit_s: float = 600.0
+    # ours
+    align_arms: str = "off"
+    restore_instants: int = 0
+    restore_colour: str = "model"
+    restore_from: float = 0.1
+    restore_light: str = "interval"
+    restore_gain: str = "bayes"
+    restore_white: str = "flat"
 
     def __post_init__(self) -> None:
         faults = [
@@ -260,6 +285,7 @@ class FitConfig:
                 (not 0 <= getattr(self, n) <= 1, f"{n} is a fraction, 0 to 1")
                 for n in ("ratio_until", "sh_warmup", "densify_until", "densify_from", "tfs_from")
             ),
+            *self._restore_faults(),
             (self.ratio_eps <= 0, "ratio_eps must be positive"),
             (not 0 < self.ratio_min <= 1 <= self.ratio_max, "ratio_min <= 1 <= ratio_max must hold"),
             *self._growth_faults(),
@@ -288,6 +314,18 @@ class FitConfig:
             (not 0 < self.densify_share <= 1, "densify_share must be in (0, 1]"),
             (not (self.densify_size > 0 and self.huge > 0), "densify_size and huge must be positive"),
             (self.opacity_reset < 0, "opacity_reset must be 0 (none) or more steps"),
+        ]
+
+    def _restore_faults(self) -> list[tuple[bool, str]]:
+        on = self.restore_instants > 0
+        return [
+            (not 0 <= self.restore_instants <= 99, "restore_instants must be 0 (off) to 99"),
+            (not 0 <= self.restore_from <= 1, "restore_from is a fraction, 0 to 1"),
+            (on and self.ratio_until > 0, "restored instants take the ratio targets' place: ratio_until must be 0"),
+            (on and self.colour_target == "truth", "the truth needs no restoring: restore_instants must be 0"),
+            (on and self.pose_label == "first", "instants are restored about mid-exposure: pose_label must be mid"),
+            (on and self.tfs_weight > 0 and self.textures_per_view > 1, "with restored instants TfS has one texture"),
+            (self.align_arms != "off" and not self.needs_spikes, "without spikes there are no arms to align"),
         ]
 
     def _ray_faults(self) -> list[tuple[bool, str]]:
@@ -325,7 +363,7 @@ class FitConfig:
     @property
     def needs_spikes(self) -> bool:
         """Whether any term reads spikes."""
-        return self.tfs_weight > 0 or self.ratio_until > 0
+        return self.tfs_weight > 0 or self.ratio_until > 0 or self.restore_instants > 0
 
     @property
     def needs_trajectory(self) -> bool:
@@ -335,7 +373,7 @@ class FitConfig:
         many = self.poses_per_view > 1 and self.ratio_until < 1
         textures = self.tfs_weight > 0 and self.textures_per_view > 1
         ratio = self.ratio_until > 0 and self.ratio_instants > 1
-        return many or textures or ratio or self.pose_label == "first"
+        return many or textures or ratio or self.restore_instants > 1 or self.pose_label == "first"
 
     def as_json(self) -> dict[str, Any]:
         """A JSON-ready record of every setting."""

@@ -30,7 +30,7 @@ from spikerig.train.fields import field_of
 from spikerig.train.gauge import Gauge
 from spikerig.train.losses import average_exposure, l2_loss, light_of, mean_weights, tfs_loss
 from spikerig.train.model import BACKGROUNDS
-from spikerig.train.parts import drawn_by, exposed_by, part_of, parts_of, start_parts
+from spikerig.train.parts import drawn_by, exposed_by, own, part_of, parts_of, start_parts
 from spikerig.train.ssim import l1_ssim
 from spikerig.train.targets import Targets, TrainView
 
@@ -269,12 +269,17 @@ def _descend(state: State, task: Task, fraction: float) -> None:
     for name, p in state.params.items():
         if (owner := part_of(config, name)) is not None:
             part, short = owner
+            if part.descend is not None:
+                continue
             rate = 0.0 if part.rate is None else part.rate(short, config, min(fraction, 1.0))
             update(p, state.moments[name], state.step + 1, rate, head=3, rest=None)
             continue
         base, share = (config.lr_gray, None) if name == "gray" else task.field.rates(name, config)
         rate = base * decay
         update(p, state.moments[name], state.step + 1, rate, head=3, rest=None if share is None else rate * share)
+    for part in parts_of(config):
+        if part.descend is not None:
+            part.descend(own(part, state.params), own(part, state.moments), config, min(fraction, 1.0))
 
 
 def check_finite(state: State) -> None:

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from spikerig.train.config import FitConfig
+from spikerig.train.contraction import contract, distance_of
 from spikerig.train.hashgrid import FEATURES, Layout, hash_encode, layout_of
 from spikerig.train.layers import chain, harmonics, new_layer
-from spikerig.train.rays import BOX, Rays, bounds
+from spikerig.train.rays import BOX, NEAREST, Rays, bounds
 from spikerig.train.volume import Traced, composite, locate, stratified, weights_of
 
 if TYPE_CHECKING:
@@ -70,8 +71,18 @@ class _Exp(torch.autograd.Function):
 
 
 def density_of(params: Tensors, config: FitConfig, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Density [N] and geometry [N,15] at points [N,3] of the gauge."""
-    features = hash_encode(points * (0.5 / BOX) + 0.5, params["table"], grid_layout(config))
+    """Density [N] and geometry [N,15] at points [N,3] of the gauge; with `contract`, density a contracted length."""
+    return density_in(params, config, unit(points, config))
+
+
+def unit(points: Tensor, config: FitConfig) -> Tensor:
+    """Points [...,3] of the gauge in the cube [0, 1]^3 that the grids fill; without `contract` some lie beyond."""
+    return contract(points) * 0.25 + 0.5 if config.contract else points * (0.5 / BOX) + 0.5
+
+
+def density_in(params: Tensors, config: FitConfig, places: Tensor) -> tuple[Tensor, Tensor]:
+    """Density [N] and geometry [N,15] at places [N,3] of the unit cube."""
+    features = hash_encode(places, params["table"], grid_layout(config))
     found = chain(params, ("density/1", "density/2"), features)
     return _Exp.apply(found[:, 0]), found[:, 1:]  # type: ignore[return-value]
 
@@ -90,11 +101,11 @@ def trace_hashed(
     background: Tensor,
     rng: np.random.Generator | None,
 ) -> list[Traced]:
-    """What rays see: `coarse` cells of the occupancy grid are looked up, `fine` samples placed, the network asked.
+    """What rays see: cells of the occupancy grid are looked up, then densities, then the networks are asked.
 
     Args:
         params, grids: of the field.
-        config: coarse, fine: numbers of samples.
+        config: coarse, probes, fine: how many cells, densities without a gradient (0: none), samples of a ray.
         rays: B of the gauge.
         background: [3].
         rng: where in their pieces samples lie; None: in the middle.
@@ -104,10 +115,10 @@ def trace_hashed(
     with torch.no_grad():
         pieces = place(grids["occupancy"], config, rays, rng, config.probes or config.fine)
         if config.probes:
-            density, _ = density_of(params, config, _points(rays, pieces.distance).reshape(-1, 3))
+            density, _ = density_of(params, config, _points(rays, along(pieces.distance, config)).reshape(-1, 3))
             weights, _ = weights_of(density.reshape(pieces.distance.shape), pieces.length)
             pieces = sample(pieces, weights, LATER_SPREAD, config.fine, rng)
-        distance, length = pieces.distance, pieces.length
+        distance, length = along(pieces.distance, config), pieces.length
         points = _points(rays, distance)
     density, geometry = density_of(params, config, points.reshape(-1, 3))
     ways = rays.directions[:, None].expand(-1, config.fine, -1).flatten(0, 1)
@@ -122,10 +133,10 @@ def _points(rays: Rays, distance: Tensor) -> Tensor:
 
 def place(occupancy: Tensor, config: FitConfig, rays: Rays, rng: np.random.Generator | None, count: int) -> Pieces:
     """`count` samples a ray where the occupancy grid has something, empty stretches left out."""
-    near, far = bounds(rays)
+    near, far = _ends(rays, config)
     shift = None if rng is None else torch.from_numpy(rng.random((len(rays), 1), np.float32)).to(near)
     looked, edges = stratified(near, far, config.coarse, shift)
-    cells = cells_of(rays.origins[:, None] + rays.directions[:, None] * looked[..., None], len(occupancy))
+    cells = cells_of(unit(_points(rays, along(looked, config)), config), len(occupancy))
     density = occupancy.reshape(-1)[cells]
     length = torch.where(density > EMPTY, edges[:, 1:] - edges[:, :-1], 0.0)
     weights, _ = weights_of(density.clamp(max=THICK), length)
@@ -149,9 +160,21 @@ def sample(pieces: Pieces, weights: Tensor, spread: float, count: int, rng: np.r
     return Pieces(found[:, count + 1 :], found[:, : count + 1], torch.diff(before).clamp(min=0))
 
 
-def cells_of(points: Tensor, side: int) -> Tensor:
-    """Numbers of the occupancy cells of points [...,3] of the gauge; beyond the box, those at its border."""
-    at = ((points * (0.5 / BOX) + 0.5) * side).long().clamp(0, side - 1)
+def _ends(rays: Rays, config: FitConfig) -> tuple[Tensor, Tensor]:
+    if not config.contract:
+        return bounds(rays)
+    near = torch.full_like(rays.forward, NEAREST)
+    return near, torch.full_like(near, 2.0)
+
+
+def along(distance: Tensor, config: FitConfig) -> Tensor:
+    """Distances along rays of where pieces are cut: themselves, or with `contract` those of contracted distances."""
+    return distance_of(distance) if config.contract else distance
+
+
+def cells_of(places: Tensor, side: int) -> Tensor:
+    """Numbers of the occupancy cells of places [...,3] of the unit cube; beyond it, those at its border."""
+    at = (places * side).long().clamp(0, side - 1)
     return (at[..., 2] * side + at[..., 1]) * side + at[..., 0]
 
 
@@ -165,7 +188,7 @@ def refresh(params: Tensors, grids: Tensors, config: FitConfig, step: Step) -> N
     # every REVISIT-th cell, another comb each time: all are visited in turn, at no cost of drawing
     cells = np.arange((step.number // REFRESH * 5) % REVISIT, total, REVISIT)
     corner = np.stack([cells % side, cells // side % side, cells // side**2], -1)
-    points = (corner + step.rng.random((len(cells), 3))) * (2 * BOX / side) - BOX
-    density, _ = density_of(params, config, torch.from_numpy(points.astype(np.float32)))
+    places = (corner + step.rng.random((len(cells), 3))) / side
+    density, _ = density_in(params, config, torch.from_numpy(places.astype(np.float32)))
     flat, where = grids["occupancy"].reshape(-1), torch.from_numpy(cells)
     flat[where] = torch.maximum(FADE * flat[where], density)

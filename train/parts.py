@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from torch import Tensor
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from spikerig.dataset.scene import View
     from spikerig.dataset.store import SceneFile
     from spikerig.train.targets import TrainView
+
+T = TypeVar("T")
 
 
 Draw = Callable[["TrainView", Tensor], list[Tensor]]  # (view, pose) -> renders
@@ -36,7 +38,9 @@ class Part:
         read: (scene, view, config) -> pictures [H,W,...] by name, kept as TrainView.beside (of a batch of pixels, the
             values there).
         start: fit.Task -> parameters by their short names; identity (a part at its start changes nothing).
-        rate: (short name, config, fraction of the run done) -> learning rate of a step.
+        rate: (short name, config, fraction of the run done) -> learning rate of a step of Adam.
+        descend: (params, moments by short name, config, fraction of the run done) instead of Adam: changes both in
+            place, by the parameters' gradients.
         pose: (params, view, phase, pose, config) -> pose of that instant, [3,4] or [B,3,4].
         expose: (params, view, picture, config) -> the exposed picture as the camera would hand it out.
         draw: (params, draw, view, pose, step, fit.Task) -> the renders that stand for draw(view, pose), each [H,W,3].
@@ -49,6 +53,7 @@ class Part:
     read: Callable[[SceneFile, View, FitConfig], dict[str, Tensor]] | None = None
     start: Callable[[Any], Tensors] | None = None
     rate: Callable[[str, FitConfig, float], float] | None = None
+    descend: Callable[[Tensors, dict[str, tuple[Tensor, Tensor]], FitConfig, float], None] | None = None
     pose: Callable[[Tensors, TrainView, float, Tensor, FitConfig], Tensor] | None = None
     expose: Callable[[Tensors, TrainView, Tensor, FitConfig], Tensor] | None = None
     draw: Callable[[Tensors, Draw, TrainView, Tensor, Step, Any], list[Tensor]] | None = None
@@ -74,6 +79,12 @@ def parts_of(config: FitConfig) -> tuple[Part, ...]:
         from spikerig.train.blurkernel import KERNEL
 
         found.append(KERNEL)
+    if config.restore_instants > 0:
+        from spikerig.train import restore
+
+        found.append(
+            Part("restore", instants=restore.instants, read=restore.read, start=restore.start, loss=restore.loss)
+        )
     return tuple(found)
 
 
@@ -95,8 +106,8 @@ def start_parts(task: Any) -> Tensors:
     }
 
 
-def own(part: Part, params: Tensors) -> Tensors:
-    """A part's parameters by their short names."""
+def own(part: Part, params: dict[str, T]) -> dict[str, T]:
+    """A part's parameters (or what else is kept by their names) by their short names."""
     prefix = f"{part.name}:"
     return {name.removeprefix(prefix): p for name, p in params.items() if name.startswith(prefix)}
 

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 NAME = "path"
 MIDDLE = PATH_PHASES.index(0.5)
+BETAS = (0.9, 0.95)
 START_PX = 1.0  # path length given to cameras that stand still: see `start`
 
 
@@ -56,20 +57,9 @@ def correction(knots: Tensor, phase: float, config: FitConfig) -> Tensor:
     return spline(knots, (phase - first) / (last - first) * pieces)
 
 
-def anchored(params: Tensors, which: Tensor | slice, phase: float, config: FitConfig) -> Tensor:
-    """The motions S [V,3,4] of some views at a fraction of the exposure, gauge freedom taken out.
-
-    Source: anchor `mean`: the mean twists of all views are made orthogonal to those of a common motion and scale (to
-        first order, at the given poses). `mid`: S(u) S(1/2)^-1, so the given mid-exposure poses hold.
-    """
-    knots = params["knots"]
-    if config.anchor == "mean":
-        common = params["freedom"].detach()
-        mean = knots.mean(1)
-        free = (common * mean[..., None]).sum((0, 1))
-        knots = knots[which] - (common[which] @ free)[:, None]
-    else:
-        knots = knots[which]
+def moves(params: Tensors, which: Tensor | slice, phase: float, config: FitConfig) -> Tensor:
+    """The motions S [V,3,4] of some views at a fraction of the exposure; anchor `mid`: S(u) S(1/2)^-1."""
+    knots = params["knots"][which]
     found = correction(knots, phase, config)
     return compose(found, inverse(correction(knots, 0.5, config))) if config.anchor == "mid" else found
 
@@ -77,13 +67,39 @@ def anchored(params: Tensors, which: Tensor | slice, phase: float, config: FitCo
 def pose(params: Tensors, view: TrainView, phase: float, given: Tensor, config: FitConfig) -> Tensor:
     """The camera of an instant: [3,4] of a view, [B,3,4] of a batch of pixels."""
     if view.pixels is None:
-        return compose(anchored(params, view.which, phase, config)[0], given)
+        return compose(moves(params, view.which, phase, config)[0], given)
     shown, of_pixel = torch.unique(view.which, return_inverse=True)
-    return compose(anchored(params, shown, phase, config)[of_pixel], given)
+    return compose(moves(params, shown, phase, config)[of_pixel], given)
+
+
+@torch.no_grad()
+def descend(params: Tensors, moments: dict[str, tuple[Tensor, Tensor]], config: FitConfig, fraction: float) -> None:
+    """One step of the views that were looked at: Adam with one length for all of a view's numbers, at its own count.
+
+    A view is looked at once an epoch; plain Adam would go on moving it in between. One length for all twelve (or more)
+    lets the directions go first that the pictures tell apart; a length each would shake the others at the same rate.
+    """
+    knots, looks, freedom = params["knots"], params["looks"], params["freedom"]
+    if knots.grad is None:
+        return
+    mean, square = moments["knots"]
+    seen = torch.nonzero(knots.grad.abs().amax((1, 2)))[:, 0]
+    looks[seen] += 1
+    gradient = knots.grad[seen]
+    mean[seen] = BETAS[0] * mean[seen] + (1 - BETAS[0]) * gradient
+    size = gradient.square().mean((1, 2), keepdim=True)
+    square[seen] = BETAS[1] * square[seen] + (1 - BETAS[1]) * size
+    count = looks[seen][:, None, None]
+    length = torch.sqrt(square[seen] / (1 - BETAS[1] ** count))
+    rate = config.lr_poses * config.lr_poses_end**fraction * min(1.0, fraction / 0.15)
+    knots[seen] -= rate * mean[seen] / (1 - BETAS[0] ** count) / length.clamp(min=1e-20)
+    if config.anchor == "mean":
+        common = (freedom * knots.mean(1)[..., None]).sum((0, 1))
+        knots -= (freedom @ common)[:, None]
 
 
 def start(task: Task) -> Tensors:
-    """Knots [N,K,6] and the directions [N,6,7] of the gauge freedom.
+    """Knots [N,K,6]; beside them the directions [N,6,7] of the gauge freedom, and how often each view was seen [N].
 
     Where the given poses move, S starts as the identity. Where a camera is given one pose for all instants, a path of
     length 0 is a saddle of the blur (any path and its reverse explain it alike), so it gets a turn of START_PX pixels
@@ -100,7 +116,11 @@ def start(task: Task) -> Tensors:
             turn = START_PX / float(task.camera.K[0, 0])
             knots[number, :, :2] = where * turn * [np.cos(angle), np.sin(angle)]
     mids = np.stack([task.gauge.pose(each[MIDDLE]) for each in targets.given]).astype(np.float64)
-    return {"knots": torch.from_numpy(knots), "freedom": torch.from_numpy(gauge_directions(mids)).float()}
+    return {
+        "knots": torch.from_numpy(knots),
+        "freedom": torch.from_numpy(gauge_directions(mids)).float(),
+        "looks": torch.zeros(len(knots)),
+    }
 
 
 def gauge_directions(poses: Floats) -> Floats:
@@ -120,12 +140,7 @@ def gauge_directions(poses: Floats) -> Floats:
     return found.reshape(-1, 6, 7)
 
 
-def rate(name: str, config: FitConfig, fraction: float) -> float:
-    """lr_poses, falling to lr_poses_end times that."""
-    return config.lr_poses * config.lr_poses_end**fraction if name == "knots" else 0.0
-
-
-PART = Part(NAME, start=start, pose=pose, rate=rate)
+PART = Part(NAME, start=start, pose=pose, descend=descend)
 
 
 def paths(state: State, task: Task) -> dict[str, Floats]:
@@ -135,10 +150,10 @@ def paths(state: State, task: Task) -> dict[str, Floats]:
     if config.trajectory == "given":
         return dict(zip(names, given, strict=True))
     params = {n: p.detach().double() for n, p in own(PART, state.params).items()}
-    moves = [anchored(params, slice(None), phase, config).numpy() for phase in PATH_PHASES]
+    turned = [moves(params, slice(None), phase, config).numpy() for phase in PATH_PHASES]
     found = np.empty_like(given)
     for k, j in np.ndindex(given.shape[:2]):
-        move = moves[j][k].copy()
+        move = turned[j][k].copy()
         move[:, 3] /= task.gauge.scale
         found[k, j] = after(move, given[k, j])
     return dict(zip(names, found, strict=True))

@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from spikerig.train.adam import update
 from spikerig.train.config import FitConfig
-from spikerig.train.hashed import cells_of, colour_of, density_of
+from spikerig.train.hashed import cells_of, colour_of, density_in, unit
 from spikerig.train.rays import BOX
 
 if TYPE_CHECKING:
@@ -29,17 +29,18 @@ def prime(params: Tensors, grids: Tensors, xyz: NDArray, rgb: NDArray, config: F
 
     Args:
         params, grids: of `start_hashed`.
-        xyz: [N,3] in the gauge; those outside the box are left out.
+        xyz: [N,3] in the gauge; those outside the box are left out (with `contract` there are none).
         rgb: [N,3] sRGB codes in [0, 1].
         config: of the fit.
 
     Edges: no point in the box changes nothing. Away from points nothing is held to be empty: rays go on looking there.
     Cost: 0.7 CPU-s at draft. Draws come from the seed: the same bits for any thread count.
     """
-    inside = (np.abs(xyz) <= BOX).all(1)
+    inside = np.isfinite(xyz).all(1) if config.contract else (np.abs(xyz) <= BOX).all(1)
     points, colours = (torch.from_numpy(np.ascontiguousarray(a[inside], np.float32)) for a in (xyz, rgb))
     if len(points) == 0:
         return
+    points = unit(points, config)
     near = _near(points, config.occupancy)
     grids["occupancy"].reshape(-1)[:] = torch.where(near, THERE, UNKNOWN)
     rng = np.random.default_rng((config.seed, 4))
@@ -55,7 +56,7 @@ def prime(params: Tensors, grids: Tensors, xyz: NDArray, rgb: NDArray, config: F
 
 
 def _near(points: Tensor, side: int) -> Tensor:
-    """Which cells [side^3] hold a point or touch one that does."""
+    """Which cells [side^3] hold a point of the unit cube or touch one that does."""
     there = torch.zeros(side**3)
     there[cells_of(points, side)] = 1
     return functional.max_pool3d(there.reshape(1, 1, side, side, side), 3, 1, 1).reshape(-1) > 0
@@ -66,10 +67,10 @@ def _loss(
 ) -> Tensor:
     half = BATCH // 2
     chosen = torch.from_numpy(rng.integers(len(points), size=half))
-    anywhere = torch.from_numpy(rng.uniform(-BOX, BOX, (half, 3)).astype(np.float32))
+    anywhere = torch.from_numpy(rng.random((half, 3), np.float32))
     ways = functional.normalize(torch.from_numpy(rng.normal(size=(half, 3)).astype(np.float32)), dim=-1)
     counts = torch.cat([torch.ones(half, dtype=torch.bool), ~near[cells_of(anywhere, config.occupancy)]])
-    density, geometry = density_of(params, config, torch.cat([points[chosen], anywhere]))
+    density, geometry = density_in(params, config, torch.cat([points[chosen], anywhere]))
     wanted = torch.cat([torch.full((half,), SOLID), torch.full((half,), THIN)])
     off = torch.where(counts, torch.log(density.clamp(min=1e-9)) - wanted, 0.0)
     colour = colour_of(params, config, geometry[:half], ways)

@@ -15,20 +15,25 @@ from spikerig.dataset.spikes import SpikeStream
 from spikerig.dataset.texture import Texture
 from spikerig.train.trajectory import sub_pose
 
-KNOTS = 33  # poses over the read-out; straight between them is exact to float32 for any hand's shake
+KNOTS = 33  # poses over the read-out; straight between them, which is thousandths of a pixel off at most
 SAME_TICKS = 4.0  # pixels read within so many ticks of each other share a texture
 
 
 def late_of(view: View) -> NDArray[np.float32] | None:
     """How much later than the middle row each pixel was exposed, in exposures: float32[H,W], 0 where not valid.
 
-    Edges: None where all rows are exposed at once, where no time passes (exposure 0), or where only one pose is known.
+    Edges: None where all rows are exposed at once, where no time passes (exposure 0), or where the poses do not reach
+        from the first row's exposure to the last one's (up to a knot's spacing beyond their ends they are extended).
     """
-    frame = view.frame
-    if frame.row_ns == 0 or frame.exposure_ns == 0 or view.trajectory is None or len(view.trajectory.at_ns) < 2:
+    frame, path = view.frame, view.trajectory
+    if frame.row_ns == 0 or frame.exposure_ns == 0 or path is None or len(path.at_ns) < 2:
         return None
     late = (view.sensor_row.astype(np.float64) - view.middle_row) * (frame.row_ns / frame.exposure_ns)
-    return np.where(view.valid, late, 0).astype(np.float32)
+    late = np.where(view.valid, late, 0).astype(np.float32)
+    times = path.at_ns.astype(np.float64)
+    first, last = (view.instant_ns(phase) for phase in (float(late.min()), 1 + float(late.max())))
+    reaches = first >= 2 * times[0] - times[1] and last <= 2 * times[-1] - times[-2]
+    return late if reaches else None
 
 
 def row_poses(view: View, phase: float, late: NDArray[np.float32]) -> Floats:
@@ -46,7 +51,7 @@ def poses_at(poses: Tensor, late: Tensor | None, pixels: Tensor) -> Tensor:
     low, high = late.aminmax()
     at = (late.reshape(-1)[pixels] - low) / (high - low).clamp(min=1e-12) * (len(poses) - 1)
     knot = at.long().clamp(0, len(poses) - 2)
-    return torch.lerp(poses[knot], poses[knot + 1], (at - knot)[:, None, None])
+    return torch.lerp(poses[knot], poses[knot + 1], (at - knot)[:, None, None].to(poses.dtype))
 
 
 def textures_by_row(

@@ -127,7 +127,10 @@ def prepare(
         "effective_tfs_weight": task.weight,
         "remarks": [*targets.remarks, *(part.remark for part in parts_of(config) if part.remark)],
         "deblurred": targets.deblurred,
-        "renders_per_step": {"ratio": 1 if targets.ratio else 0, "average": len({*targets.colour, *targets.tfs})},
+        "renders_per_step": {
+            "ratio": 1 if targets.ratio else 0,
+            "average": len({*targets.colour, *targets.tfs, *targets.also}),
+        },
     }
     return task, record
 
@@ -202,7 +205,9 @@ def _tell(task: Task, record: dict[str, Any]) -> None:
     config = task.config
     length = f"{config.seconds:g} s" if config.seconds > 0 else f"{config.steps} steps"
     note(f"{config.method} on {record['scene']['name']}: {len(task.targets.views)} views, {length}, seed {config.seed}")
-    note(f"  pose label '{config.pose_label}'; {len(set(task.targets.colour))} sub-pose(s) a view for colour")
+    note(
+        f"  pose label '{config.pose_label}'; {len({*task.targets.colour, *task.targets.also})} sub-pose(s) a view for colour"
+    )
     if config.tfs_weight > 0:
         note(
             f"  TfS: w = {config.tfs_weight:g} read as '{config.weight_reading}': {task.weight:g} on means; "

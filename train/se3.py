@@ -6,6 +6,8 @@ float64 NumPy and has no gradients. All functions take float32 or float64 and an
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from math import factorial
 
 import torch
@@ -36,9 +38,35 @@ QUAD = [
 QUAD_FROM = [[float(row.get(k, 0)) for row in QUAD] for k in range(9)]
 
 
+@cache
+def _constants(dtype: torch.dtype) -> tuple[Tensor, ...]:
+    """Coefficients of the three series, factors and constants of the quaternion's matrix, the unit matrix, 0 1 2..."""
+    tables = (EXP_SERIES, [[c] for c in LOG_SERIES], [[c] for c in ATAN_SERIES], QUAD_FROM, QUAD_ONE)
+    counted = torch.arange(len(ATAN_SERIES), dtype=dtype)
+    return *(torch.tensor(table, dtype=dtype) for table in tables), torch.eye(3, dtype=dtype), counted
+
+
 def _series(s: Tensor, coefficients: Tensor) -> Tensor:
     """The polynomials sum_k c[k] s^k: [..., C] for c [K,C]."""
-    return s[..., None] ** torch.arange(len(coefficients), dtype=s.dtype) @ coefficients
+    return s[..., None] ** _constants(s.dtype)[-1][: len(coefficients)] @ coefficients
+
+
+def _choose(near: Tensor, s: Tensor, series: Tensor, exact: Callable[[Tensor], Tensor]) -> Tensor:
+    """A function [..., C] of s by its series where `near`, else by `exact` (which is only shown s that are not)."""
+    if bool(near.all()):  # small motions, the rule in training, at half the cost
+        return _series(s, series)
+    return torch.where(near[..., None], _series(torch.where(near, s, 0.0), series), exact(torch.where(near, 1.0, s)))
+
+
+def _exp_exact(s: Tensor) -> Tensor:
+    a = torch.sqrt(s)
+    sine, half = torch.sin(a), torch.sin(a / 2)
+    return torch.stack([sine / a, 2 * half * half / s, (a - sine) / (s * a)], -1)
+
+
+def _log_exact(s: Tensor) -> Tensor:
+    half = torch.sqrt(s) / 2
+    return ((1 - half * torch.cos(half) / torch.sin(half)) / s)[..., None]
 
 
 def exp_se3(twist: Tensor) -> Tensor:
@@ -49,20 +77,15 @@ def exp_se3(twist: Tensor) -> Tensor:
     """
     w, v = twist[..., :3], twist[..., 3:]
     s = (w * w).sum(-1)
-    near = s < NEAR
-    small = _series(torch.where(near, s, 0.0), s.new_tensor(EXP_SERIES))
-    t = torch.where(near, 1.0, s)
-    a = torch.sqrt(t)
-    sine, half = torch.sin(a), torch.sin(a / 2)
-    large = torch.stack([sine / a, 2 * half * half / t, (a - sine) / (t * a)], -1)
-    first, second, third = torch.where(near[..., None], small, large)[..., None].unbind(-2)
+    exp_series, _, _, _, _, unit, _ = _constants(w.dtype)
+    first, second, third = _choose(s < NEAR, s, exp_series, _exp_exact)[..., None].unbind(-2)
     wv = torch.linalg.cross(w, v)
     shift = v + second * wv + third * torch.linalg.cross(w, wv)
     x, y, z = (first * w).unbind(-1)
     nil = torch.zeros_like(x)
     skew = torch.stack([nil, -z, y, z, nil, -x, -y, x, nil], -1).unflatten(-1, (3, 3))
-    square = w[..., :, None] * w[..., None, :] - s[..., None, None] * torch.eye(3, dtype=w.dtype)
-    R = torch.eye(3, dtype=w.dtype) + skew + second[..., None] * square
+    square = w[..., :, None] * w[..., None, :] - s[..., None, None] * unit
+    R = unit + skew + second[..., None] * square
     return torch.cat([R, shift[..., None]], -1)
 
 
@@ -74,31 +97,29 @@ def rotation_vector(R: Tensor) -> Tensor:
         identity the gradient is that of (R - R^T)/2, exactly.
     Source: unit quaternion by the largest of the four squares (Shepperd), then atan2.
     """
-    quad = (R.flatten(-2) @ R.new_tensor(QUAD_FROM) + R.new_tensor(QUAD_ONE)).unflatten(-1, (4, 4))
+    _, _, series, factors, ones, _, _ = _constants(R.dtype)
+    quad = (R.flatten(-2) @ factors + ones).unflatten(-1, (4, 4))
     best = quad.detach().diagonal(dim1=-2, dim2=-1).argmax(-1)
     q = torch.take_along_dim(quad, best[..., None, None], -2).squeeze(-2)
     q = torch.where(q.detach()[..., :1] < 0, -q, q)
-    real, rest = q[..., 0], q[..., 1:]
-    length = (rest * rest).sum(-1)
+    real, rest = q[..., :1], q[..., 1:]
+    length = (rest * rest).sum(-1, keepdim=True)
     near = length < ATAN_NEAR * real * real
+    if bool(near.all()):
+        return rest * _series((length / (real * real))[..., 0], series) / real
     safe = torch.where(near, real, 1.0)
-    small = _series(torch.where(near, length / (safe * safe), 0.0), R.new_tensor(ATAN_SERIES)[:, None])[..., 0] / safe
+    small = _series(torch.where(near, length / (safe * safe), 0.0)[..., 0], series) / safe
     root = torch.sqrt(torch.where(near, 1.0, length))
-    large = 2 * torch.atan2(root, real) / root
-    return rest * torch.where(near, small, large)[..., None]
+    return rest * torch.where(near, small, 2 * torch.atan2(root, real) / root)
 
 
 def log_se3(pose: Tensor) -> Tensor:
     """Twists [...,6] whose `exp_se3` are the rigid motions [...,3,4]; angles up to pi (see `rotation_vector`)."""
     w, t = rotation_vector(pose[..., :3]), pose[..., 3]
     s = (w * w).sum(-1)
-    near = s < NEAR
-    small = _series(torch.where(near, s, 0.0), s.new_tensor(LOG_SERIES)[:, None])[..., 0]
-    safe = torch.where(near, 1.0, s)
-    half = torch.sqrt(safe) / 2
-    large = (1 - half * torch.cos(half) / torch.sin(half)) / safe
+    factor = _choose(s < NEAR, s, _constants(s.dtype)[1], _log_exact)
     wt = torch.linalg.cross(w, t)
-    return torch.cat([w, t - wt / 2 + torch.where(near, small, large)[..., None] * torch.linalg.cross(w, wt)], -1)
+    return torch.cat([w, t - wt / 2 + factor * torch.linalg.cross(w, wt)], -1)
 
 
 def compose(a: Tensor, b: Tensor) -> Tensor:

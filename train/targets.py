@@ -16,6 +16,7 @@ from spikerig.dataset.errors import DataError, NumericsError, UsageError
 from spikerig.dataset.scene import Floats, View
 from spikerig.dataset.terminal import Progress
 from spikerig.train import rolling
+from spikerig.train.arms import align
 from spikerig.train.config import FitConfig
 from spikerig.train.deblurred import Deblurred, deblurred, frame_light
 from spikerig.train.gauge import Gauge
@@ -143,6 +144,8 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
     ratio = phases(config.ratio_instants, "midpoints", config.pose_label) if config.ratio_until > 0 else ()
     if config.ratio_until >= 1:
         colour, tfs = ratio, (ratio if tfs else ())
+    if config.restore_instants > 0:
+        colour = ()  # the part has a colour term of its own
     parts = parts_of(config)
     also = tuple(dict.fromkeys(p for part in parts if part.instants is not None for p in part.instants(config)))
     sharper = deblurred(scene, config)
@@ -159,10 +162,22 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
             next="spikerig data check FILE",
         )
     gray = solve(pairs, config.gray, scene.light_gain) if config.needs_spikes else None
+    remarks = _remarks(raw)
+    if gray is not None and config.align_arms != "off":
+        motion = align(raw, np.array([*gray.weights, gray.bias]), gray.white, config.align_arms)
+        pairs = Pairs()
+        for each in raw:
+            pairs.add(each["codes"], each["light"], each["mean"], each["mean_known"] & each["valid"])
+        gray = solve(pairs, config.gray, scene.light_gain)
+        x, y = motion.shift_px
+        remarks += (
+            f"frames were moved by {x:+.2f}, {y:+.2f} px to meet the spikes ({config.align_arms}; rms of the grays' "
+            f"difference {motion.rms_before:.4f} -> {motion.rms_after:.4f} of white)",
+        )
     views = tuple(_finish(each, k, config, gauge, gray, (colour, tfs, ratio)) for k, each in enumerate(raw))
     given = [each["given"] for each in raw] if config.moves_cameras else np.zeros((0, len(PATH_PHASES), 3, 4))
     about = None if sharper is None else sharper.about
-    return Targets(views, colour, tfs, ratio, gray, _remarks(raw), also, np.array(given), about)
+    return Targets(views, colour, tfs, ratio, gray, remarks, also, np.array(given), about)
 
 
 def _remarks(raw: list[dict[str, Any]]) -> tuple[str, ...]:
@@ -174,7 +189,7 @@ def _remarks(raw: list[dict[str, Any]]) -> tuple[str, ...]:
         return (told + "every row has its own instant (poses, textures)",)
     return (
         told + "every row is treated as read when the middle one was (poses, textures), so fast shake skews; fields "
-        "nerf and nerf-fast follow the rows where the poses over the exposure are known",
+        "nerf and nerf-fast follow the rows where poses over the whole read-out are known",
     )
 
 
@@ -220,7 +235,7 @@ def _read(
     if config.needs_spikes:
         (mean,) = light_at(view, 0.5, late, scene.clock, straight, exposures(view, scene.clock))
         pairs.add(view.frame.pixels8, light, mean.light, mean.known & view.valid)
-        made["mean"], made["mean_known"] = mean.light, mean.known
+        made["mean"], made["mean_known"], made["codes"] = mean.light, mean.known, view.frame.pixels8
         for phase in dict.fromkeys((*tfs, *ratio)):
             make = partial(textures_at, kind=config.textures, window=config.texture_window)
             made["textures"][phase] = light_at(view, phase, late, scene.clock, straight, make)
@@ -251,7 +266,7 @@ def _finish(
 ) -> TrainView:
     _, tfs, ratio = instants
     light, valid = torch.from_numpy(raw["light"]), raw["valid"]
-    clipped = light.clamp(0, 1)
+    clipped = light.clamp(0, None if config.highlights == "keep" else 1)  # a truth may be brighter than white
     made: dict[float, Instant] = {}
     for phase, pose in raw["pose"].items():
         textures, target = (), torch.zeros(0, dtype=torch.half)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,6 +18,20 @@ class Traced:
     colour: Tensor
     alpha: Tensor
     depth: Tensor
+
+
+class _Alpha(torch.autograd.Function):
+    """1 - e^-x with the gradient e^-x itself: torch's of expm1 is 1 + (e^-x - 1), which is 0 from x = 17 on."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
+        return -torch.expm1(-x)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> Any:
+        (x,) = ctx.saved_tensors
+        return grads[0] * torch.exp(-x)
 
 
 def weights_of(density: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
@@ -34,9 +49,9 @@ def weights_of(density: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
     Source: paper, Eq. 3. Oracle: `ray_oracles.weights_of`.
     """
     thick = (density * length).clamp(max=THICKEST)
-    behind = torch.cumsum(thick, -1)
-    before = torch.cat([torch.zeros_like(behind[..., :1]), behind[..., :-1]], -1)
-    return torch.exp(-before) * -torch.expm1(-thick), torch.exp(-behind[..., -1])
+    behind = torch.cumsum(thick, -1, dtype=torch.float64)  # 10,000 float32 sums would be off by 1e-4
+    before = torch.cat([torch.zeros_like(behind[..., :1]), behind[..., :-1]], -1).to(thick.dtype)
+    return torch.exp(-before) * _Alpha.apply(thick), torch.exp(-behind[..., -1]).to(thick.dtype)
 
 
 def composite(density: Tensor, length: Tensor, distance: Tensor, colour: Tensor, background: Tensor) -> Traced:

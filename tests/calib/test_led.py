@@ -5,7 +5,7 @@ import panel_worlds as worlds
 import pytest
 
 from spikerig.calib.led_find import find_in_frames, find_in_spikes, periods_to_try
-from spikerig.calib.led_frames import frame_sights, spike_sights, timeline
+from spikerig.calib.led_frames import Timeline, frame_sights, spike_sights, timeline
 from spikerig.calib.led_read import Beat, Blinks, beat_of, spike_blinks
 from spikerig.calib.panel_frames import Look
 from spikerig.calib.panel_read import Spot
@@ -184,3 +184,21 @@ def test_missed_edges_of_a_light_without_a_beat_are_refused():
     blinks = Blinks(np.array([0, 10, 30]), np.array([True, True, False]), np.ones(3), (0, 50))
     with pytest.raises(DataError, match="were missed"):
         timeline(blinks, Beat(0.0, 0.0, (0,), 1e9), 0, 0)
+
+
+def test_light_that_changes_once_is_no_led():
+    bits = np.zeros((20_000, *SHAPE), np.uint8)
+    rng = np.random.default_rng(2)
+    bits[:, 4:9, 5:12] = rng.random((20_000, 5, 7)) < np.where(np.arange(20_000) < 11_000, 0.05, 0.7)[:, None, None]
+    shadow = SpikeStream(np.packbits(bits, axis=2, bitorder="little"), 48, RATE, 0, "spike")
+    with pytest.raises(DataError, match="no LED"):
+        find_in_spikes([shadow], periods_to_try(300e6, 1e9))
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_lit_time_is_that_of_the_edges(first):
+    at = np.array([100, 250, 300, 700], np.int64)
+    line = Timeline(at, np.arange(4) % 2 == (0 if first else 1), 0, 1000, 0.0)
+    fine = np.arange(0, 1001)
+    on = (np.searchsorted(at, fine[:-1], side="right") % 2 == 1) == first
+    np.testing.assert_array_equal(np.diff(line.lit_ns(fine)), on)
