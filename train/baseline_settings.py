@@ -18,7 +18,10 @@ def baseline_faults(config: Any) -> list[tuple[bool, str]]:
         (not 1 <= config.edi_bins <= 1000, "edi_bins must be 1 to 1000"),
         (not 0 <= config.kernel_points <= 64, "kernel_points must be 0 (no kernel) to 64"),
         (not 0 <= config.kernel_start <= 1, "kernel_start is a fraction, 0 to 1"),
-        *((config.kernel_points > 0 and wrong, text) for wrong, text in _kernel_faults(config)),
+        (
+            config.kernel_points > 0 and config.poses_per_view > 1,
+            "a kernel stands for sub-poses: poses_per_view must be 1",
+        ),
         (not 1 <= frames <= 99 or frames % 2 == 0, "restorer_frames must be odd, 1 to 99"),
         (not 0 <= config.restorer_bins <= 100, "restorer_bins must be 0 (no events) to 100"),
         (not 1 <= config.restorer_pad <= 256, "restorer_pad must be 1 to 256"),
@@ -31,12 +34,4 @@ def _event_faults(config: Any) -> list[tuple[bool, str]]:
         (config.poses_per_view < 2, "events tie two sub-poses: poses_per_view must be 2 or more"),
         (config.instants_rule != "endpoints", "events lie between the ends of bins: instants_rule must be endpoints"),
         (config.fresh_poses == 1, "events tie two renders of a step: fresh_poses must not be 1"),
-    ]
-
-
-def _kernel_faults(config: Any) -> list[tuple[bool, str]]:
-    fast = config.field == "nerf-fast"
-    return [
-        (config.poses_per_view > 1, "a kernel stands for the sub-poses: poses_per_view must be 1"),
-        (fast, "no gradient says where rays of nerf-fast should go, so no kernel is learned: field splat or nerf"),
     ]
