@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from spikerig.dataset.errors import UsageError
-from spikerig.train.baseline_settings import baseline_faults
 
 CHOICES: dict[str, tuple[str, ...]] = {
     "field": ("splat", "nerf", "nerf-fast"),
@@ -113,15 +112,15 @@ class FitConfig:
     Ratio: until `ratio_until` of the run the colour target is the frame times the ratio of the texture at one of
     `ratio_instants` instants (a random one a step) to the exposure's mean.
 
-    Ours (train/restore.py): with `restore_instants` n > 0 each of n instants has a target made of the model's own renders,
-    in place of the colour term; fields of rays render all n a step. `restore_colour`: the target's colour is the
-    frame's, or from `restore_from` of the run on the model's, times what its own blur lacks to be the frame.
+    Ours (train/restore.py): with `restore_instants` n > 0 each of n instants has a target made of the model's own
+    renders, in place of the colour term; fields of rays render all n a step. `restore_colour`: the target's colour is
+    the frame's, or from `restore_from` of the run on the model's, times what its own blur lacks to be the frame.
     `restore_light`: an interval between spikes is compared with the renders it covers, or with its instant's.
     `restore_gain`: spikes correct the gray fully, or by what they are worth against what the model knows (bayes).
-    `restore_white`: what a spike means comes from the frame's own gray (ratio), or from a flat field that all views give.
-    `texture_window` bounds the intervals; with `highlights` keep, light above white is trained from spikes, and channels
-    that clip only say "at least". `align_arms` (any method with spikes, train/arms.py): frames are first moved onto the
-    spikes by the shift or affine motion that all views together show.
+    `restore_white`: what a spike means comes from the frame's own gray (ratio), or from a flat field that all views
+    give. `texture_window` bounds the intervals; with `highlights` keep, light above white is trained from spikes, and
+    channels that clip only say "at least". `align_arms` (any method with spikes, train/arms.py): frames are first moved
+    onto the spikes by the shift or affine motion that all views together show.
 
     Baselines (docs/baselines.md): `colour_target` frame, truth, edi (frames deblurred by events: `edi_form` continuous,
     or binned in `edi_bins`) or restored (by the network `restorer`, which runs only with `trust`; it sees
@@ -236,8 +235,8 @@ class FitConfig:
     edi_form: str = "continuous"
     edi_bins: int = 4
     kernel_points: int = 0
-    kernel_start: float = 0.1
-    kernel_align: float = 0.1
+    kernel_start: float = 0.02
+    kernel_align: float = 0.01
     lr_kernel: float = 5e-3
     restorer: str = ""
     trust: bool = False
@@ -255,105 +254,16 @@ class FitConfig:
     restore_white: str = "flat"
 
     def __post_init__(self) -> None:
+        from spikerig.train.faults import faults_of
+
         faults = [
             f"{name} is '{getattr(self, name)}', not one of {', '.join(choices)}"
             for name, choices in CHOICES.items()
             if getattr(self, name) not in choices
         ]
-        faults += [text for wrong, text in self._range_faults() if wrong]
+        faults += faults_of(self)
         if faults:
             raise UsageError("the settings of this fit do not hold together", value="; ".join(faults))
-
-    def _range_faults(self) -> list[tuple[bool, str]]:
-        positive = ("steps", "splats", "densify_every", "poses_per_view", "textures_per_view", "texture_window")
-        positive += ("rays", "views_per_step", "coarse", "fine", "width")
-        rates = [f.name for f in fields(self) if f.name.startswith("lr_")]
-        return [
-            *((getattr(self, name) < 1, f"{name} must be at least 1") for name in (*positive, "ratio_instants")),
-            *((not 0 <= getattr(self, name) < 1e6, f"{name} must be 0 or more") for name in rates),
-            *(
-                (not 0 <= getattr(self, n) < 1e12, f"{n} must be 0 or more")
-                for n in ("noise", "tfs_weight", "seconds", "densify_grad", "exposure_tv")
-            ),
-            (not 0 <= self.sh_degree <= 3, "sh_degree must be 0 to 3"),
-            (self.fresh_poses < 0, "fresh_poses must be 0 (all) or more"),
-            (not 0 < self.init_opacity < 1, "init_opacity must lie between 0 and 1"),
-            (not 0 < self.init_scale < 1e3, "init_scale must be positive"),
-            (not 0 <= self.ssim_weight <= 1, "ssim_weight must be 0 to 1"),
-            (not 0 < self.lr_end <= 1, "lr_end must be in (0, 1]"),
-            *(
-                (not 0 <= getattr(self, n) <= 1, f"{n} is a fraction, 0 to 1")
-                for n in ("ratio_until", "sh_warmup", "densify_until", "densify_from", "tfs_from")
-            ),
-            *self._restore_faults(),
-            (self.ratio_eps <= 0, "ratio_eps must be positive"),
-            (not 0 < self.ratio_min <= 1 <= self.ratio_max, "ratio_min <= 1 <= ratio_max must hold"),
-            *self._growth_faults(),
-            *self._ray_faults(),
-            (
-                self.exposure != "off" and self.colour_target == "truth",
-                "the sharp truth has no exposure of its own to correct: exposure must be off",
-            ),
-            (
-                self.exposure == "bilateral" and self.field != "splat",
-                "a bilateral grid needs whole pictures (field splat): exposure affine corrects rays too",
-            ),
-            *self._path_faults(),
-            *baseline_faults(self),
-            (self.pose_label == "first" and self.colour_target == "truth", "the truth is not labelled by pose_label"),
-        ]
-
-    def _growth_faults(self) -> list[tuple[bool, str]]:
-        default = self.densify == "default"
-        return [
-            (self.absgrad and not default, "absgrad is what densify default watches"),
-            (self.absgrad and self.device == "cuda", "absgrad is of the native rasteriser: device must be cpu"),
-            (self.densify_by != "all" and not default, "densify_by is of densify default"),
-            (self.densify_by == "tfs" and self.tfs_weight == 0, "densify_by tfs needs a TfS term"),
-            (0 < self.splats_most < self.splats, "splats_most must be 0 or at least splats"),
-            (not 0 < self.densify_share <= 1, "densify_share must be in (0, 1]"),
-            (not (self.densify_size > 0 and self.huge > 0), "densify_size and huge must be positive"),
-            (self.opacity_reset < 0, "opacity_reset must be 0 (none) or more steps"),
-        ]
-
-    def _restore_faults(self) -> list[tuple[bool, str]]:
-        on = self.restore_instants > 0
-        return [
-            (not 0 <= self.restore_instants <= 99, "restore_instants must be 0 (off) to 99"),
-            (not 0 <= self.restore_from <= 1, "restore_from is a fraction, 0 to 1"),
-            (on and self.ratio_until > 0, "restored instants take the ratio targets' place: ratio_until must be 0"),
-            (on and self.colour_target == "truth", "the truth needs no restoring: restore_instants must be 0"),
-            (on and self.pose_label == "first", "instants are restored about mid-exposure: pose_label must be mid"),
-            (on and self.tfs_weight > 0 and self.textures_per_view > 1, "with restored instants TfS has one texture"),
-            (self.align_arms != "off" and not self.needs_spikes, "without spikes there are no arms to align"),
-        ]
-
-    def _ray_faults(self) -> list[tuple[bool, str]]:
-        if self.field == "splat":
-            return []
-        return [
-            (self.colour_loss != "l2", "a batch of rays has no neighbours for SSIM: colour_loss must be l2"),
-            (self.fresh_poses > 0, "renders of single rays are not remembered: fresh_poses must be 0"),
-            (self.densify != "off", "only splats densify"),
-            (self.views_per_step > self.rays, "views_per_step must not exceed rays"),
-            (max(self.coarse, self.fine, self.width) > 4096, "coarse, fine and width are at most 4096"),
-            (self.rays > 1 << 20, "rays is at most 2^20"),
-            (not 0 <= self.probes <= 4096, "probes must be 0 to 4096"),
-            (not 4 <= self.occupancy <= 512, "occupancy must be 4 to 512"),
-        ]
-
-    def _path_faults(self) -> list[tuple[bool, str]]:
-        least = 4 if self.trajectory == "cubic" else 2
-        still = self.trajectory == "given" and (self.path_from == "mid" or self.knots != 0 or self.knots_at != "even")
-        return [
-            (self.knots != 0 and not least <= self.knots <= 64, f"knots must be 0 or {least} to 64"),
-            (self.knots != 0 and self.knots_at == "spikes", "the spikes say how many knots there are: knots must be 0"),
-            (self.moves_cameras and self.colour_target == "truth", "the truth is seen from its true poses, which hold"),
-            (still, "knots, knots_at and path_from belong to trajectory=linear or cubic"),
-            (not 0 < self.lr_poses_end <= 1, "lr_poses_end must be in (0, 1]"),
-            (not 0 <= self.pose_noise_deg <= 90, "pose_noise_deg must be 0 to 90"),
-            (not 0 <= self.pose_noise_share <= 1, "pose_noise_share must be 0 to 1"),
-        ]
 
     @property
     def moves_cameras(self) -> bool:

@@ -205,9 +205,8 @@ def _tell(task: Task, record: dict[str, Any]) -> None:
     config = task.config
     length = f"{config.seconds:g} s" if config.seconds > 0 else f"{config.steps} steps"
     note(f"{config.method} on {record['scene']['name']}: {len(task.targets.views)} views, {length}, seed {config.seed}")
-    note(
-        f"  pose label '{config.pose_label}'; {len({*task.targets.colour, *task.targets.also})} sub-pose(s) a view for colour"
-    )
+    instants = len({*task.targets.colour, *task.targets.also})
+    note(f"  pose label '{config.pose_label}'; {instants} sub-pose(s) a view for colour")
     if config.tfs_weight > 0:
         note(
             f"  TfS: w = {config.tfs_weight:g} read as '{config.weight_reading}': {task.weight:g} on means; "
