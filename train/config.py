@@ -123,6 +123,15 @@ class FitConfig:
     give. `texture_window` bounds the intervals; with `highlights` keep, light above white is trained from spikes, and
     channels that clip only say "at least". `align_arms` (any method with spikes, train/arms.py): frames are first moved
     onto the spikes by the shift or affine motion that all views together show.
+
+    Baselines (docs/baselines.md): `colour_target` frame, truth, edi (frames deblurred by events: `edi_form` continuous,
+    or binned in `edi_bins`) or restored (by the network `restorer`, which runs only with `trust`; it sees
+    `restorer_frames` views and `restorer_bins` event sums of each, sides padded to multiples of `restorer_pad`, and has
+    `restorer_limit_s` for all). `average_domain`: sub-poses and kernels are averaged as linear light or as encoded
+    codes. `event_weight` of E2NeRF's loss (renders at bin ends against events); `event_light` is what it takes the log
+    of; `event_pos` and `event_neg` are thresholds (0: those recorded); `event_shift` is added to counts, `event_hinge`
+    weighs pixels without events. `kernel_points` of Deblur-NeRF's kernel, from `kernel_start` of the run on, its first
+    point held by `kernel_align`.
     """
 
     field: str = "splat"
@@ -229,8 +238,8 @@ class FitConfig:
     edi_form: str = "continuous"
     edi_bins: int = 4
     kernel_points: int = 0
-    kernel_start: float = 0.1
-    kernel_align: float = 0.1
+    kernel_start: float = 0.02
+    kernel_align: float = 0.01
     lr_kernel: float = 5e-3
     restorer: str = ""
     trust: bool = False

@@ -147,7 +147,14 @@ def e2_5x(config: FitConfig) -> FitConfig:
     Unlike there, light is averaged and compared linear, and thresholds are the scene's own: here blur and events are
     made of linear light, so the published domains and thresholds (docs/baselines.md) would only weaken it.
     """
-    return replace(config, method="e2-5x", poses_per_view=5, instants_rule="endpoints", event_weight=0.001)
+    return replace(
+        config,
+        method="e2-5x",
+        colour_loss="l2",
+        poses_per_view=5,
+        instants_rule="endpoints",
+        event_weight=0.001,
+    )
 
 
 def deblur(config: FitConfig) -> FitConfig:
