@@ -19,7 +19,10 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "densify_by": ("all", "colour", "tfs"),
     "exposure": ("off", "affine", "bilateral"),
     "colour_loss": ("l1ssim", "l2"),
-    "colour_target": ("frame", "truth"),
+    "colour_target": ("frame", "truth", "edi", "restored"),
+    "average_domain": ("linear", "encoded"),
+    "event_light": ("linear", "encoded"),
+    "edi_form": ("continuous", "binned"),
     "pose_label": ("mid", "first"),
     "instants_rule": ("midpoints", "endpoints"),
     "textures": ("both", "tfp", "tfi", "tfi-window", "raw"),
@@ -27,6 +30,15 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "tfs_domain": ("encoded", "linear", "luma", "naive"),
     "highlights": ("clip", "keep"),
     "gray": ("calibrated", "rec601", "learned", "constrained", "response"),
+    "trajectory": ("given", "linear", "cubic"),
+    "knots_at": ("even", "spikes"),
+    "path_from": ("given", "mid"),
+    "anchor": ("mean", "mid", "none"),
+    "align_arms": ("off", "shift", "affine"),
+    "restore_colour": ("model", "frame"),
+    "restore_light": ("interval", "instant"),
+    "restore_gain": ("bayes", "full"),
+    "restore_white": ("flat", "ratio"),
     "weight_reading": ("mean", "sum-batch", "sum-image", "u8"),
     "device": ("cpu", "cuda"),
 }
@@ -72,6 +84,17 @@ class FitConfig:
     at random, and remembers the last renders of the others (the gradient is scaled by n/k): the average at the cost
     of k renders a step instead of n.
 
+    Paths: `trajectory` given trains no camera. With linear or cubic, every training camera's pose is that given times
+    an SE(3) spline in its frame that is optimised with the scene: screws between `knots` knots (0: 2), or a cumulative
+    cubic B-spline of as many control poses (0: 4). Knots lie evenly over the exposure (`knots_at` even), or the pieces
+    of the spline end at the instants of the textures (spikes; `knots` is 0 then). `path_from` given starts at the
+    scene's trajectory, or at the mid-exposure pose, which then stands for all instants, where it has none; mid always
+    does the latter. `anchor` mean: what all cameras do in common (a motion, a scale) is projected out; mid:
+    mid-exposure poses hold, only the motion around them is learned; none. Rates `lr_poses` (radians and the normalised
+    scene's units) fall to `lr_poses_end` times that. For studies, `pose_noise_deg` degrees and `pose_noise_share` of
+    half the scene's size about each axis (standard deviations, drawn by seed and view) are put onto the poses given; at
+    the exposure's ends as much again, halved, in opposite directions.
+
     TfS: `tfs_weight` in the reading `weight_reading` of Eq. TfS (`effective_weight` maps it); textures at
     `textures_per_view` instants, of kind `textures` (`both` = TFP and TFI, averaged to one residual by `tfs_combine`
     average, or two losses by sum; `tfi-window` = TFI over as many intervals as fit into `texture_window` ticks, the
@@ -88,6 +111,16 @@ class FitConfig:
 
     Ratio: until `ratio_until` of the run the colour target is the frame times the ratio of the texture at one of
     `ratio_instants` instants (a random one a step) to the exposure's mean.
+
+    Ours (train/restore.py): with `restore_instants` n > 0 each of n instants has a target made of the model's own
+    renders, in place of the colour term; fields of rays render all n a step. `restore_colour`: the target's colour is
+    the frame's, or from `restore_from` of the run on the model's, times what its own blur lacks to be the frame.
+    `restore_light`: an interval between spikes is compared with the renders it covers, or with its instant's.
+    `restore_gain`: spikes correct the gray fully, or by what they are worth against what the model knows (bayes).
+    `restore_white`: what a spike means comes from the frame's own gray (ratio), or from a flat field that all views
+    give. `texture_window` bounds the intervals; with `highlights` keep, light above white is trained from spikes, and
+    channels that clip only say "at least". `align_arms` (any method with spikes, train/arms.py): frames are first moved
+    onto the spikes by the shift or affine motion that all views together show.
     """
 
     field: str = "splat"
@@ -155,6 +188,16 @@ class FitConfig:
     instants_rule: str = "midpoints"
     exposure: str = "off"
     exposure_tv: float = 10.0
+    # paths
+    trajectory: str = "given"
+    knots: int = 0
+    knots_at: str = "even"
+    path_from: str = "given"
+    anchor: str = "mean"
+    lr_poses: float = 1e-3
+    lr_poses_end: float = 0.01
+    pose_noise_deg: float = 0.0
+    pose_noise_share: float = 0.0
     # TfS
     tfs_weight: float = 0.0
     tfs_from: float = 0.0
@@ -172,92 +215,66 @@ class FitConfig:
     ratio_eps: float = 0.01
     ratio_min: float = 0.15
     ratio_max: float = 6.0
+    # baselines
+    average_domain: str = "linear"
+    event_weight: float = 0.0
+    event_light: str = "linear"
+    event_pos: float = 0.0
+    event_neg: float = 0.0
+    event_shift: float = 0.5
+    event_hinge: float = 0.0
+    edi_form: str = "continuous"
+    edi_bins: int = 4
+    kernel_points: int = 0
+    kernel_start: float = 0.1
+    kernel_align: float = 0.1
+    lr_kernel: float = 5e-3
+    restorer: str = ""
+    trust: bool = False
+    restorer_frames: int = 1
+    restorer_bins: int = 0
+    restorer_pad: int = 8
+    restorer_limit_s: float = 600.0
+    # ours
+    align_arms: str = "off"
+    restore_instants: int = 0
+    restore_colour: str = "model"
+    restore_from: float = 0.1
+    restore_light: str = "interval"
+    restore_gain: str = "bayes"
+    restore_white: str = "flat"
 
     def __post_init__(self) -> None:
+        from spikerig.train.faults import faults_of
+
         faults = [
             f"{name} is '{getattr(self, name)}', not one of {', '.join(choices)}"
             for name, choices in CHOICES.items()
             if getattr(self, name) not in choices
         ]
-        faults += [text for wrong, text in self._range_faults() if wrong]
+        faults += faults_of(self)
         if faults:
             raise UsageError("the settings of this fit do not hold together", value="; ".join(faults))
 
-    def _range_faults(self) -> list[tuple[bool, str]]:
-        positive = ("steps", "splats", "densify_every", "poses_per_view", "textures_per_view", "texture_window")
-        positive += ("rays", "views_per_step", "coarse", "fine", "width")
-        rates = [f.name for f in fields(self) if f.name.startswith("lr_")]
-        return [
-            *((getattr(self, name) < 1, f"{name} must be at least 1") for name in (*positive, "ratio_instants")),
-            *((not 0 <= getattr(self, name) < 1e6, f"{name} must be 0 or more") for name in rates),
-            *(
-                (not 0 <= getattr(self, n) < 1e12, f"{n} must be 0 or more")
-                for n in ("noise", "tfs_weight", "seconds", "densify_grad", "exposure_tv")
-            ),
-            (not 0 <= self.sh_degree <= 3, "sh_degree must be 0 to 3"),
-            (self.fresh_poses < 0, "fresh_poses must be 0 (all) or more"),
-            (not 0 < self.init_opacity < 1, "init_opacity must lie between 0 and 1"),
-            (not 0 < self.init_scale < 1e3, "init_scale must be positive"),
-            (not 0 <= self.ssim_weight <= 1, "ssim_weight must be 0 to 1"),
-            (not 0 < self.lr_end <= 1, "lr_end must be in (0, 1]"),
-            *(
-                (not 0 <= getattr(self, n) <= 1, f"{n} is a fraction, 0 to 1")
-                for n in ("ratio_until", "sh_warmup", "densify_until", "densify_from", "tfs_from")
-            ),
-            (self.ratio_eps <= 0, "ratio_eps must be positive"),
-            (not 0 < self.ratio_min <= 1 <= self.ratio_max, "ratio_min <= 1 <= ratio_max must hold"),
-            *self._growth_faults(),
-            *self._ray_faults(),
-            (
-                self.exposure != "off" and self.colour_target == "truth",
-                "the sharp truth has no exposure of its own to correct: exposure must be off",
-            ),
-            (
-                self.exposure == "bilateral" and self.field != "splat",
-                "a bilateral grid needs whole pictures (field splat): exposure affine corrects rays too",
-            ),
-            (self.pose_label == "first" and self.colour_target == "truth", "the truth is not labelled by pose_label"),
-        ]
-
-    def _growth_faults(self) -> list[tuple[bool, str]]:
-        default = self.densify == "default"
-        return [
-            (self.absgrad and not default, "absgrad is what densify default watches"),
-            (self.absgrad and self.device == "cuda", "absgrad is of the native rasteriser: device must be cpu"),
-            (self.densify_by != "all" and not default, "densify_by is of densify default"),
-            (self.densify_by == "tfs" and self.tfs_weight == 0, "densify_by tfs needs a TfS term"),
-            (0 < self.splats_most < self.splats, "splats_most must be 0 or at least splats"),
-            (not 0 < self.densify_share <= 1, "densify_share must be in (0, 1]"),
-            (not (self.densify_size > 0 and self.huge > 0), "densify_size and huge must be positive"),
-            (self.opacity_reset < 0, "opacity_reset must be 0 (none) or more steps"),
-        ]
-
-    def _ray_faults(self) -> list[tuple[bool, str]]:
-        if self.field == "splat":
-            return []
-        return [
-            (self.colour_loss != "l2", "a batch of rays has no neighbours for SSIM: colour_loss must be l2"),
-            (self.fresh_poses > 0, "renders of single rays are not remembered: fresh_poses must be 0"),
-            (self.densify != "off", "only splats densify"),
-            (self.views_per_step > self.rays, "views_per_step must not exceed rays"),
-            (max(self.coarse, self.fine, self.width) > 4096, "coarse, fine and width are at most 4096"),
-            (self.rays > 1 << 20, "rays is at most 2^20"),
-            (not 0 <= self.probes <= 4096, "probes must be 0 to 4096"),
-            (not 4 <= self.occupancy <= 512, "occupancy must be 4 to 512"),
-        ]
+    @property
+    def moves_cameras(self) -> bool:
+        """Whether training cameras are not those of the scene."""
+        return self.trajectory != "given" or self.pose_noise_deg > 0 or self.pose_noise_share > 0
 
     @property
     def needs_spikes(self) -> bool:
         """Whether any term reads spikes."""
-        return self.tfs_weight > 0 or self.ratio_until > 0
+        return self.tfs_weight > 0 or self.ratio_until > 0 or self.restore_instants > 0
 
     @property
     def needs_trajectory(self) -> bool:
-        """Whether any instant but mid-exposure is rendered."""
+        """Whether any instant but mid-exposure is rendered, from a pose that must be given."""
+        if self.trajectory != "given":
+            return False
         many = self.poses_per_view > 1 and self.ratio_until < 1
         textures = self.tfs_weight > 0 and self.textures_per_view > 1
         ratio = self.ratio_until > 0 and self.ratio_instants > 1
-        return many or textures or ratio or self.pose_label == "first"
+        return many or textures or ratio or self.restore_instants > 1 or self.pose_label == "first"
 
     def as_json(self) -> dict[str, Any]:
         """A JSON-ready record of every setting."""

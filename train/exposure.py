@@ -23,9 +23,7 @@ if TYPE_CHECKING:
 GRID = (8, 16, 16)  # of a bilateral grid: brightness, rows, columns
 IDENTITY = torch.eye(3, 4)
 LUMA = (0.2126, 0.7152, 0.0722)
-REMARK = (
-    "every training frame has a colour correction of its own (mean: none); held-out views are drawn and scored without"
-)
+REMARK = "each training frame has a colour correction of its own (mean: none); held-out views are scored without one"
 
 
 def start(task: Any) -> Tensors:

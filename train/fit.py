@@ -30,7 +30,7 @@ from spikerig.train.fields import field_of
 from spikerig.train.gauge import Gauge
 from spikerig.train.losses import average_exposure, l2_loss, light_of, mean_weights, tfs_loss
 from spikerig.train.model import BACKGROUNDS
-from spikerig.train.parts import exposed_by, part_of, parts_of, pose_of, start_parts
+from spikerig.train.parts import drawn_by, exposed_by, own, part_of, parts_of, start_parts
 from spikerig.train.ssim import l1_ssim
 from spikerig.train.targets import Targets, TrainView
 
@@ -181,7 +181,7 @@ def view_loss(state: State, task: Task, view: TrainView, step: Step) -> Tensor:
     model = task.model(state)
 
     def draw(phase: float) -> list[Tensor]:
-        images = task.field.draw(model, view, pose_of(state.params, view, phase, config), step)
+        images = drawn_by(state.params, view, phase, step, task, lambda v, pose: task.field.draw(model, v, pose, step))
         if config.fresh_poses > 0:
             state.memory[view.name, phase] = light_of(images[0]).half()
         return images
@@ -212,7 +212,7 @@ def _pictures_loss(
     elif drawn:
         kept = [state.memory[view.name, p] for p in targets.colour if p not in pictures]
         others = sum((light.float() for light in kept[1:]), kept[0].float()) if kept else None
-        exposed = exposed_by(state.params, view, average_exposure(drawn, others, len(targets.colour)), config)
+        exposed = exposed_by(state.params, view, _average(drawn, others, task), config)
         loss = len(targets.colour) / len(drawn) * colour_loss(exposed, view.frame, view.valid, config)
     else:  # only an instant with textures and no part in the average
         loss = torch.zeros(())
@@ -225,6 +225,13 @@ def _pictures_loss(
             step.note("parts", sum(part.loss(state, task, view, pictures, step), torch.zeros(())))
             loss = loss + step.notes["parts"][-1]
     return loss
+
+
+def _average(drawn: list[Tensor], others: Tensor | None, task: Task) -> Tensor:
+    """The exposed picture of sub-poses, in the config's domain."""
+    if task.config.average_domain == "encoded":
+        return torch.stack(drawn).mean(0)
+    return average_exposure(drawn, others, len(task.targets.colour))
 
 
 def _fresh(state: State, task: Task, view: TrainView, rng: np.random.Generator) -> list[float]:
@@ -262,12 +269,17 @@ def _descend(state: State, task: Task, fraction: float) -> None:
     for name, p in state.params.items():
         if (owner := part_of(config, name)) is not None:
             part, short = owner
+            if part.descend is not None:
+                continue
             rate = 0.0 if part.rate is None else part.rate(short, config, min(fraction, 1.0))
             update(p, state.moments[name], state.step + 1, rate, head=3, rest=None)
             continue
         base, share = (config.lr_gray, None) if name == "gray" else task.field.rates(name, config)
         rate = base * decay
         update(p, state.moments[name], state.step + 1, rate, head=3, rest=None if share is None else rate * share)
+    for part in parts_of(config):
+        if part.descend is not None:
+            part.descend(own(part, state.params), own(part, state.moments), config, min(fraction, 1.0))
 
 
 def check_finite(state: State) -> None:

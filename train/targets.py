@@ -16,13 +16,15 @@ from spikerig.dataset.errors import DataError, NumericsError, UsageError
 from spikerig.dataset.scene import Floats, View
 from spikerig.dataset.terminal import Progress
 from spikerig.train import rolling
+from spikerig.train.arms import align
 from spikerig.train.config import FitConfig
+from spikerig.train.deblurred import Deblurred, deblurred, frame_light
 from spikerig.train.gauge import Gauge
 from spikerig.train.gray import Gray, Pairs, solve
 from spikerig.train.losses import mean_weights, ratio_target, srgb_from_linear
 from spikerig.train.parts import parts_of
 from spikerig.train.spikelight import average_texture, exposures, light_at, textures_at
-from spikerig.train.trajectory import phases, pose_at, sub_pose
+from spikerig.train.trajectory import PATH_PHASES, given_pose, phases, pose_at
 
 if TYPE_CHECKING:
     from spikerig.dataset.store import SceneFile
@@ -70,7 +72,8 @@ class TrainView:
 class Targets:
     """All training views, the instants each term uses (fractions of the exposure), the converter, remarks.
 
-    `also`: further instants that parts ask for.
+    `also`: further instants that parts ask for. `given`: where cameras move, the poses [N,5,3,4] of the world that the
+    fit was given at PATH_PHASES. `deblurred`: how pictures were deblurred first, for run.json.
     """
 
     views: tuple[TrainView, ...]
@@ -80,6 +83,8 @@ class Targets:
     gray: Gray | None
     remarks: tuple[str, ...] = field(default=())
     also: tuple[float, ...] = field(default=())
+    given: Floats = field(default_factory=lambda: np.zeros((0, len(PATH_PHASES), 3, 4)))
+    deblurred: dict[str, Any] | None = None
 
 
 def views_of_step(targets: Targets, seed: int, step: int, count: int = 1) -> list[TrainView]:
@@ -112,7 +117,8 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
         DataError: no training views, nothing valid in them, no spikes, no trajectory or no truth where the method
             needs it; a colour spike camera.
         NumericsError: true light that is not finite.
-        UsageError: single spikes are asked for, and the spike arm's lens bends.
+        UsageError: single spikes are asked for, and the spike arm's lens bends; a restorer that is not there or may not
+            run.
     Cost: a texture takes milliseconds; memory 12 bytes a pixel and view, +4 a texture, +6 a ratio instant.
     """
     if not scene.train:
@@ -138,11 +144,14 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
     ratio = phases(config.ratio_instants, "midpoints", config.pose_label) if config.ratio_until > 0 else ()
     if config.ratio_until >= 1:
         colour, tfs = ratio, (ratio if tfs else ())
+    if config.restore_instants > 0:
+        colour = ()  # the part has a colour term of its own
     parts = parts_of(config)
     also = tuple(dict.fromkeys(p for part in parts if part.instants is not None for p in part.instants(config)))
+    sharper = deblurred(scene, config)
     pairs, raw, bar = Pairs(), [], Progress("preparing views", len(scene.train), "views")
-    for name in scene.train:
-        raw.append(_read(scene, name, config, (colour, tfs, ratio, also), pairs, straight))
+    for number, name in enumerate(scene.train):
+        raw.append(_read(scene, name, number, config, gauge, (colour, tfs, ratio, also), pairs, straight, sharper))
         bar.step()
     if not any(each["valid"].any() for each in raw):
         raise DataError(
@@ -153,8 +162,22 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
             next="spikerig data check FILE",
         )
     gray = solve(pairs, config.gray, scene.light_gain) if config.needs_spikes else None
+    remarks = _remarks(raw)
+    if gray is not None and config.align_arms != "off":
+        motion = align(raw, np.array([*gray.weights, gray.bias]), gray.white, config.align_arms)
+        pairs = Pairs()
+        for each in raw:
+            pairs.add(each["codes"], each["light"], each["mean"], each["mean_known"] & each["valid"])
+        gray = solve(pairs, config.gray, scene.light_gain)
+        x, y = motion.shift_px
+        remarks += (
+            f"frames were moved by {x:+.2f}, {y:+.2f} px to meet the spikes ({config.align_arms}; rms of the grays' "
+            f"difference {motion.rms_before:.4f} -> {motion.rms_after:.4f} of white)",
+        )
     views = tuple(_finish(each, k, config, gauge, gray, (colour, tfs, ratio)) for k, each in enumerate(raw))
-    return Targets(views, colour, tfs, ratio, gray, _remarks(raw), also)
+    given = [each["given"] for each in raw] if config.moves_cameras else np.zeros((0, len(PATH_PHASES), 3, 4))
+    about = None if sharper is None else sharper.about
+    return Targets(views, colour, tfs, ratio, gray, remarks, also, np.array(given), about)
 
 
 def _remarks(raw: list[dict[str, Any]]) -> tuple[str, ...]:
@@ -173,46 +196,50 @@ def _remarks(raw: list[dict[str, Any]]) -> tuple[str, ...]:
 def _read(
     scene: SceneFile,
     name: str,
+    number: int,
     config: FitConfig,
+    gauge: Gauge,
     instants: tuple[tuple[float, ...], ...],
     pairs: Pairs,
     straight: Straight,
+    sharper: Deblurred | None,
 ) -> dict[str, Any]:
-    from spikerig.dataset.images import linear_from_srgb
-
     colour, tfs, ratio, also = instants
     view = scene.view(name, spikes=config.needs_spikes)
-    decode = np.arange(view.frame.full + 1) / view.frame.full
-    if view.frame.transfer == "srgb":
-        decode = linear_from_srgb(decode)
-    light = np.asarray(decode, np.float32)[view.frame.pixels]
-    late = None if config.field == "splat" or config.colour_target == "truth" else rolling.late_of(view)
+    light = frame_light(view)
+    late = None
+    if config.field != "splat" and config.colour_target != "truth" and not config.moves_cameras:
+        late = rolling.late_of(view)
+
+    def given(phase: float) -> Floats:
+        return given_pose(view, number, phase, config, gauge.scale)
+
     made: dict[str, Any] = {
         "name": name,
         "late": late,
-        "light": light,
+        "light": light if sharper is None else sharper.light[name],
         "valid": np.array(view.valid),
         "row_ns": view.frame.row_ns,
-        "pose": {phase: _poses(view, phase, late) for phase in dict.fromkeys((*colour, *tfs, *ratio, *also))},
+        "pose": {
+            phase: given(phase) if late is None else rolling.row_poses(view, phase, late)
+            for phase in dict.fromkeys((*colour, *tfs, *ratio, *also))
+        },
         "beside": {n: t for part in parts_of(config) if part.read for n, t in part.read(scene, view, config).items()},
         "textures": {},
     }
     if config.colour_target == "truth":
         made["light"] = _finite(np.array(scene.truth_light(name), np.float32), name, scene)
         made["pose"] = dict.fromkeys(made["pose"], truth_pose(scene, view))
+    if config.moves_cameras:
+        made["given"] = [given(phase) for phase in PATH_PHASES]
     if config.needs_spikes:
         (mean,) = light_at(view, 0.5, late, scene.clock, straight, exposures(view, scene.clock))
         pairs.add(view.frame.pixels8, light, mean.light, mean.known & view.valid)
-        made["mean"], made["mean_known"] = mean.light, mean.known
+        made["mean"], made["mean_known"], made["codes"] = mean.light, mean.known, view.frame.pixels8
         for phase in dict.fromkeys((*tfs, *ratio)):
             make = partial(textures_at, kind=config.textures, window=config.texture_window)
             made["textures"][phase] = light_at(view, phase, late, scene.clock, straight, make)
     return made
-
-
-def _poses(view: View, phase: float, late: NDArray[np.float32] | None) -> Floats:
-    """[3,4], or with a rolling shutter [K,3,4] over the read-out."""
-    return sub_pose(view, phase) if late is None else rolling.row_poses(view, phase, late)
 
 
 def _finite(light: NDArray[np.float32], name: str, scene: SceneFile) -> NDArray[np.float32]:
@@ -239,7 +266,7 @@ def _finish(
 ) -> TrainView:
     _, tfs, ratio = instants
     light, valid = torch.from_numpy(raw["light"]), raw["valid"]
-    clipped = light.clamp(0, 1)
+    clipped = light.clamp(0, None if config.highlights == "keep" else 1)  # a truth may be brighter than white
     made: dict[float, Instant] = {}
     for phase, pose in raw["pose"].items():
         textures, target = (), torch.zeros(0, dtype=torch.half)
