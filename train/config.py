@@ -73,15 +73,15 @@ class FitConfig:
     Ratio: until `ratio_until` of the run the colour target is the frame times the ratio of the texture at one of
     `ratio_instants` instants (a random one a step) to the exposure's mean.
 
-    Ours (train/restore.py): with `restore_instants` n > 0 each of n instants has a target made of the model's own renders,
-    in place of the colour term; fields of rays render all n a step. `restore_colour`: the target's colour is the
-    frame's, or from `restore_from` of the run on the model's, times what its own blur lacks to be the frame.
+    Ours (train/restore.py): with `restore_instants` n > 0 each of n instants has a target made of the model's own
+    renders, in place of the colour term; fields of rays render all n a step. `restore_colour`: the target's colour is
+    the frame's, or from `restore_from` of the run on the model's, times what its own blur lacks to be the frame.
     `restore_light`: an interval between spikes is compared with the renders it covers, or with its instant's.
     `restore_gain`: spikes correct the gray fully, or by what they are worth against what the model knows (bayes).
-    `restore_white`: what a spike means comes from the frame's own gray (ratio), or from a flat field that all views give.
-    `texture_window` bounds the intervals; with `highlights` keep, light above white is trained from spikes, and channels
-    that clip only say "at least". `align_arms` (any method with spikes, train/arms.py): frames are first moved onto the
-    spikes by the shift or affine motion that all views together show.
+    `restore_white`: what a spike means comes from the frame's own gray (ratio), or from a flat field of all views.
+    `texture_window` bounds the intervals; with `highlights` keep, light above white is trained from spikes, and
+    channels that clip only say "at least". `align_arms` (any method with spikes, train/arms.py): frames are first moved
+    onto the spikes by the shift or affine motion that all views together show.
     """
 
     field: str = "splat"

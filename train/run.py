@@ -112,7 +112,10 @@ def prepare(
         "gray": None if found is None else found.as_json(),
         "effective_tfs_weight": task.weight,
         "remarks": list(targets.remarks),
-        "renders_per_step": {"ratio": 1 if targets.ratio else 0, "average": len({*targets.colour, *targets.tfs, *targets.also})},
+        "renders_per_step": {
+            "ratio": 1 if targets.ratio else 0,
+            "average": len({*targets.colour, *targets.tfs, *targets.also}),
+        },
     }
     return task, record
 
@@ -164,7 +167,8 @@ def _tell(task: Task, record: dict[str, Any]) -> None:
     config = task.config
     length = f"{config.seconds:g} s" if config.seconds > 0 else f"{config.steps} steps"
     note(f"{config.method} on {record['scene']['name']}: {len(task.targets.views)} views, {length}, seed {config.seed}")
-    note(f"  pose label '{config.pose_label}'; {len({*task.targets.colour, *task.targets.also})} sub-pose(s) a view for colour")
+    poses = len({*task.targets.colour, *task.targets.also})
+    note(f"  pose label '{config.pose_label}'; {poses} sub-pose(s) a view for colour")
     if config.tfs_weight > 0:
         note(
             f"  TfS: w = {config.tfs_weight:g} read as '{config.weight_reading}': {task.weight:g} on means; "
