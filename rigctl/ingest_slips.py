@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.errors import DataError
-from spikerig.dataset.rawtake import RawTake, WireBytes, read_lines
+from spikerig.dataset.rawtake import RawTake, TakenView, WireBytes, read_lines
 from spikerig.rigctl.slips import Missing, Spans, find_slips
 
 
@@ -64,6 +67,14 @@ class MendedBytes(WireBytes):
         end, bytes_ = self._doubtful.get(epoch, (0, 0))
         first, last = max(start, self.sent(epoch, end) - bytes_), min(stop, self.sent(epoch, end))
         return found + ([(first, last)] if first < last else [])
+
+
+def mended(take: RawTake, views: Sequence[TakenView]) -> tuple[MendedBytes, list[TakenView]]:
+    """A take's bytes with small losses put back, and its viewpoints with spans in bytes as the camera sent them."""
+    wire = MendedBytes(take, [s for v in views for s in v.spikes])
+    return wire, [
+        replace(v, spikes=tuple((e, wire.sent(e, a), wire.sent(e, b)) for e, a, b in v.spikes)) for v in views
+    ]
 
 
 def _doubtful_ends(take: RawTake) -> dict[int, tuple[int, int]]:

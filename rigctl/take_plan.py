@@ -13,6 +13,7 @@ from typing import Any
 from spikerig.dataset.errors import RigError, UsageError
 from spikerig.dataset.segments import PAGE
 from spikerig.dataset.wire import WireProfile
+from spikerig.rigctl.led_view import LedPlan
 from spikerig.rigctl.panel_view import PanelPlan
 from spikerig.rigctl.profiles import DEFAULT, profile_named, profile_of
 from spikerig.rigctl.recorder_options import OnFull, RecorderOptions
@@ -65,8 +66,8 @@ class Sync:
     """`[sync]`: how the clocks are brought together.
 
     Args:
-        mode: "box": a Harp clock box with the LED panel in both views; "optical": any blinking LED in both views;
-            "none": host stamps alone, a bound of milliseconds.
+        mode: "box": a Harp clock box with the LED panel in both views; "optical": any plain blinking LED in both views
+            (`[led]`), for the time between the two cameras alone; "none": nothing: frames and spikes are not paired.
         port: of the box; empty: the only one there is.
         probe_s: seconds between two questions to the box; 16 a second are what a minute of hold-over within 100 us
             needs (docs/clock.md).
@@ -134,6 +135,7 @@ class _Top:
     checks: Any = limits({})
     recorder: Any = limits({})
     panel: Any = limits(None)
+    led: Any = limits(None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +168,7 @@ class TakePlan:
     checks: Checks
     recorder: Keeping
     panel: PanelPlan | None = None
+    led: LedPlan | None = None
 
     def as_json(self) -> dict[str, Any]:
         """The plan, whole, JSON-ready."""
@@ -216,8 +219,13 @@ def read_plan(table: Mapping[str, Any], source: str = "the plan") -> TakePlan:
         _profile(spike, source, faults), spike, rgb, read_record(Sync, top.sync, "sync", faults), checks,
         read_record(Keeping, top.recorder, "recorder", faults),
         None if top.panel is None else read_record(PanelPlan, top.panel, "panel", faults),
+        None if top.led is None else read_record(LedPlan, top.led, "led", faults),
     )  # fmt: skip
-    panel = plan[-1]
+    panel, led = plan[-2:]
+    if isinstance(led, LedPlan):
+        for arm in ("spike", "rgb"):
+            if len(getattr(led, arm)) % 2:
+                faults.add(f"led.{arm}", f"is {list(getattr(led, arm))}, expected x and y of each LED")
     if isinstance(panel, PanelPlan) and panel.bits is not None and panel.slow >= panel.bits:
         faults.add("panel.slow", f"is {panel.slow}, expected below panel.bits, {panel.bits}")
     faults.raise_any()

@@ -33,8 +33,8 @@ def field_cost(scene: Path, *, method: str, preset: str, rounds: int, seed: int 
         steps_per_second (of wall time), times_nerf (CPU of nerf's step over this one's).
     """
     from spikerig.dataset.store import open_scene
-    from spikerig.train.config import configure
     from spikerig.train.fit import new_state, one_step, torch_threads
+    from spikerig.train.methods import configure
     from spikerig.train.run import prepare
 
     rows = {"splat": preset, "nerf-fast": preset, "nerf": "paper"}

@@ -5,15 +5,8 @@ from dataclasses import replace
 import pytest
 
 from spikerig.dataset.errors import UsageError
-from spikerig.train.config import (
-    FIELDS,
-    METHODS,
-    FitConfig,
-    configure,
-    effective_weight,
-    from_json,
-    parse_setting,
-)
+from spikerig.train.config import FitConfig, effective_weight, from_json, parse_setting
+from spikerig.train.methods import FIELDS, METHODS, configure
 
 
 @pytest.mark.parametrize("method", METHODS)

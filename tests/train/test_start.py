@@ -6,8 +6,8 @@ import pytest
 from spikerig.dataset.errors import DataError
 from spikerig.dataset.rigid import exp_se3
 from spikerig.dataset.scene import Points
-from spikerig.train.config import configure
 from spikerig.train.gauge import Gauge, gauge_of
+from spikerig.train.methods import configure
 from spikerig.train.start import SH0, fill, spacing, start_splats
 
 

@@ -14,8 +14,8 @@ from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.scene import Camera, Pose
 from spikerig.dataset.store import open_scene, write_scene
 from spikerig.rigctl.sim.capture import capture
-from spikerig.train.config import configure
 from spikerig.train.gauge import Gauge
+from spikerig.train.methods import configure
 from spikerig.train.scene_dataset import SceneDataset
 from spikerig.train.targets import Targets, load_targets
 

@@ -18,7 +18,7 @@ from spikerig.dataset.scene import Pose
 from spikerig.dataset.store import open_scene, write_scene
 from spikerig.train import metrics
 from spikerig.train.bridge import bridge
-from spikerig.train.config import configure
+from spikerig.train.methods import configure
 from spikerig.train.model import SplatModel
 from spikerig.train.nerfbaselines import write_results
 from spikerig.train.realign import realign, twist_gradient
