@@ -46,7 +46,8 @@ def load(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     try:
         with safe_open(path, framework="pt") as file:
             record = json.loads((file.metadata() or {}).get("spikerig", "null"))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+            # clones, because torch's sums have other last bits where memory is not aligned
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (not a dict)
     except FileNotFoundError as error:
         raise DataError("there is no checkpoint", value=path, next="spikerig train fit SCENE.h5 -o RUN") from error
     except (OSError, SafetensorError, ValueError) as error:

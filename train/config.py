@@ -15,16 +15,25 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "field": ("splat", "nerf", "nerf-fast"),
     "init": ("points", "random"),
     "background": ("black", "white", "random"),
-    "densify": ("off", "mcmc"),
+    "densify": ("off", "mcmc", "default"),
+    "densify_by": ("all", "colour", "tfs"),
+    "exposure": ("off", "affine", "bilateral"),
     "colour_loss": ("l1ssim", "l2"),
-    "colour_target": ("frame", "truth"),
+    "colour_target": ("frame", "truth", "edi", "restored"),
+    "average_domain": ("linear", "encoded"),
+    "event_light": ("linear", "encoded"),
+    "edi_form": ("continuous", "binned"),
     "pose_label": ("mid", "first"),
     "instants_rule": ("midpoints", "endpoints"),
     "textures": ("both", "tfp", "tfi", "tfi-window", "raw"),
     "tfs_combine": ("average", "sum"),
     "tfs_domain": ("encoded", "linear", "luma", "naive"),
     "highlights": ("clip", "keep"),
-    "gray": ("calibrated", "rec601", "learned"),
+    "gray": ("calibrated", "rec601", "learned", "constrained", "response"),
+    "trajectory": ("given", "linear", "cubic"),
+    "knots_at": ("even", "spikes"),
+    "path_from": ("given", "mid"),
+    "anchor": ("mean", "mid", "none"),
     "align_arms": ("off", "shift", "affine"),
     "restore_colour": ("model", "frame"),
     "restore_light": ("interval", "instant"),
@@ -35,11 +44,13 @@ CHOICES: dict[str, tuple[str, ...]] = {
 }
 PAPER_BATCH = 1024
 SPLAT_ONLY = {
-    "splats", "init", "init_opacity", "init_scale", "antialias", "densify", "densify_every", "densify_until", "noise",
+    "splats", "init_opacity", "init_scale", "antialias", "densify", "densify_every", "densify_until", "noise",
+    "densify_from", "densify_by", "densify_grad", "densify_size", "densify_share", "splats_most", "huge", "absgrad",
+    "opacity_reset",
     "opacity_reg", "scale_reg", "sh_warmup", "ssim_weight", "fresh_poses", "lr_means", "lr_scales", "lr_quats",
     "lr_opacities", "lr_colours",
 }  # fmt: skip
-FAST_ONLY = {"grid_levels", "coarsest", "finest", "table_log2", "occupancy", "lr_grid"}
+FAST_ONLY = {"grid_levels", "coarsest", "finest", "table_log2", "occupancy", "probes", "contract", "lr_grid"}
 RAYS_ONLY = {"rays", "views_per_step", "coarse", "fine", "width", "lr_net", *FAST_ONLY}
 
 
@@ -47,14 +58,25 @@ RAYS_ONLY = {"rays", "views_per_step", "coarse", "fine", "width", "lr_net", *FAS
 class FitConfig:
     """All knobs of a fit; units in the names or beside them.
 
-    Model: `splats` is the number to start with (points are thinned or duplicated to it) and the cap of densification;
+    Model: `splats` is the number to start with (points are thinned or duplicated to it), `splats_most` the cap of
+    densification (0: `splats` itself for mcmc, four times it for default);
     learning rates are per step at the start of the run and fall exponentially to `lr_end` times that, by the fraction
     of steps done, or of seconds spent where `seconds` > 0. `lr_means` is in units of the normalised scene ([-1, 1]).
 
+    Densification, every `densify_every` steps between the fractions `densify_from` (default only) and `densify_until`
+    of the run. mcmc: `noise`. default (train/grow.py): splats whose mean screen gradient is above `densify_grad` (loss
+    per half picture; 0: 2e-4, or 8e-4 with `absgrad`, which sums its absolute values over pixels) are cloned, or split
+    where larger than `densify_size`, at most `densify_share` of all in a round; those fainter than 0.005 are dropped,
+    and after the first of the opacity resets every `opacity_reset` steps (0: none) those larger than `huge` (gauge
+    units). `densify_by`: the gradient of the whole loss, or of the colour or the TfS term alone.
+
     Rays (fields nerf and nerf-fast): a step draws `rays` pixels, from `views_per_step` views in equal shares. `coarse`
     and `fine` are samples a ray: of the two networks of nerf; for nerf-fast the places looked up in the occupancy grid,
-    and those the network sees. `width` is that of the hidden layers; `grid_levels` levels of a hash grid go from
-    `coarsest` to `finest` cells along an axis with at most 2^`table_log2` rows each; `occupancy` cells along an axis.
+    and those the networks are trained at; with `probes` > 0 the density of so many places, looked up without gradient,
+    says where those are. nerf-fast starts from the scene's points, or with `init` random from nothing. `width` is that
+    of the hidden layers; `grid_levels` levels of a hash grid go from `coarsest` to `finest` cells along an axis with at
+    most 2^`table_log2` rows each; `occupancy` cells along an axis. `contract`: the space beyond
+    the unit ball is drawn in to radius 2 and looked at out to infinity; without, a box around all points and cameras.
 
     Camera: a blurry frame is explained by `poses_per_view` sub-poses of its exposure, averaged in linear light. One
     sub-pose is the instant of `pose_label` (the paper does not say which). More lie at (j+1/2)/n of the exposure
@@ -62,13 +84,30 @@ class FitConfig:
     at random, and remembers the last renders of the others (the gradient is scaled by n/k): the average at the cost
     of k renders a step instead of n.
 
+    Paths: `trajectory` given trains no camera. With linear or cubic, every training camera's pose is that given times
+    an SE(3) spline in its frame that is optimised with the scene: screws between `knots` knots (0: 2), or a cumulative
+    cubic B-spline of as many control poses (0: 4). Knots lie evenly over the exposure (`knots_at` even), or the pieces
+    of the spline end at the instants of the textures (spikes; `knots` is 0 then). `path_from` given starts at the
+    scene's trajectory, or at the mid-exposure pose, which then stands for all instants, where it has none; mid always
+    does the latter. `anchor` mean: what all cameras do in common (a motion, a scale) is projected out; mid:
+    mid-exposure poses hold, only the motion around them is learned; none. Rates `lr_poses` (radians and the normalised
+    scene's units) fall to `lr_poses_end` times that. For studies, `pose_noise_deg` degrees and `pose_noise_share` of
+    half the scene's size about each axis (standard deviations, drawn by seed and view) are put onto the poses given; at
+    the exposure's ends as much again, halved, in opposite directions.
+
     TfS: `tfs_weight` in the reading `weight_reading` of Eq. TfS (`effective_weight` maps it); textures at
     `textures_per_view` instants, of kind `textures` (`both` = TFP and TFI, averaged to one residual by `tfs_combine`
     average, or two losses by sum; `tfi-window` = TFI over as many intervals as fit into `texture_window` ticks, the
     least noisy; `raw` = the spike bit itself). `tfs_domain`: encoded = sRGB of texture against sRGB
     of the gray of the linearised render; linear = both linear; luma = gray of the encoded render against the encoded
     texture; naive = gray of the encoded render against the linear texture (wrong, for the ablation). `highlights`:
-    clip textures to display white, where RGB ends too, or keep them.
+    clip textures to display white, where RGB ends too, or keep them. `gray`: how RGB becomes what a spike sees:
+    calibrated before training and frozen; rec601; learned (the paper's, free); constrained (learned, positive weights
+    of fixed sum); response (constrained, then a learned monotone curve). Learned ones start from Rec.601.
+    `tfs_from`: fraction of the run where TfS begins.
+
+    Exposure (train/exposure.py): frames of different gain or white balance, as real captures have them. affine: a
+    colour matrix and offset a view, in linear light; bilateral: a grid of them a view, smoothed by `exposure_tv`.
 
     Ratio: until `ratio_until` of the run the colour target is the frame times the ratio of the texture at one of
     `ratio_instants` instants (a random one a step) to the exposure's mean.
@@ -78,8 +117,8 @@ class FitConfig:
     the frame's, or from `restore_from` of the run on the model's, times what its own blur lacks to be the frame.
     `restore_light`: an interval between spikes is compared with the renders it covers, or with its instant's.
     `restore_gain`: spikes correct the gray fully, or by what they are worth against what the model knows (bayes).
-    `restore_white`: what a spike means comes from the frame's own gray (ratio), or from a flat field of all views.
-    `texture_window` bounds the intervals; with `highlights` keep, light above white is trained from spikes, and
+    `restore_white`: what a spike means comes from the frame's own gray (ratio), or from a flat field that all views
+    give. `texture_window` bounds the intervals; with `highlights` keep, light above white is trained from spikes, and
     channels that clip only say "at least". `align_arms` (any method with spikes, train/arms.py): frames are first moved
     onto the spikes by the shift or affine motion that all views together show.
     """
@@ -103,6 +142,15 @@ class FitConfig:
     densify: str = "off"
     densify_every: int = 100
     densify_until: float = 0.7
+    densify_from: float = 0.05
+    densify_by: str = "all"
+    densify_grad: float = 0.0
+    densify_size: float = 0.01
+    densify_share: float = 1.0
+    splats_most: int = 0
+    huge: float = 0.1
+    absgrad: bool = False
+    opacity_reset: int = 3000
     noise: float = 5e4
     opacity_reg: float = 0.0
     scale_reg: float = 0.0
@@ -117,6 +165,8 @@ class FitConfig:
     finest: int = 512
     table_log2: int = 16
     occupancy: int = 64
+    probes: int = 32
+    contract: bool = False
     # rates
     lr_means: float = 4e-4
     lr_scales: float = 3e-2
@@ -124,6 +174,7 @@ class FitConfig:
     lr_opacities: float = 3e-2
     lr_colours: float = 1e-2
     lr_gray: float = 1e-3
+    lr_exposure: float = 2e-3
     lr_net: float = 5e-4
     lr_grid: float = 1e-2
     lr_end: float = 0.3
@@ -135,8 +186,21 @@ class FitConfig:
     fresh_poses: int = 0
     pose_label: str = "mid"
     instants_rule: str = "midpoints"
+    exposure: str = "off"
+    exposure_tv: float = 10.0
+    # paths
+    trajectory: str = "given"
+    knots: int = 0
+    knots_at: str = "even"
+    path_from: str = "given"
+    anchor: str = "mean"
+    lr_poses: float = 1e-3
+    lr_poses_end: float = 0.01
+    pose_noise_deg: float = 0.0
+    pose_noise_share: float = 0.0
     # TfS
     tfs_weight: float = 0.0
+    tfs_from: float = 0.0
     weight_reading: str = "mean"
     textures_per_view: int = 1
     textures: str = "both"
@@ -151,6 +215,26 @@ class FitConfig:
     ratio_eps: float = 0.01
     ratio_min: float = 0.15
     ratio_max: float = 6.0
+    # baselines
+    average_domain: str = "linear"
+    event_weight: float = 0.0
+    event_light: str = "linear"
+    event_pos: float = 0.0
+    event_neg: float = 0.0
+    event_shift: float = 0.5
+    event_hinge: float = 0.0
+    edi_form: str = "continuous"
+    edi_bins: int = 4
+    kernel_points: int = 0
+    kernel_start: float = 0.1
+    kernel_align: float = 0.1
+    lr_kernel: float = 5e-3
+    restorer: str = ""
+    trust: bool = False
+    restorer_frames: int = 1
+    restorer_bins: int = 0
+    restorer_pad: int = 8
+    restorer_limit_s: float = 600.0
     # ours
     align_arms: str = "off"
     restore_instants: int = 0
@@ -161,64 +245,21 @@ class FitConfig:
     restore_white: str = "flat"
 
     def __post_init__(self) -> None:
+        from spikerig.train.faults import faults_of
+
         faults = [
             f"{name} is '{getattr(self, name)}', not one of {', '.join(choices)}"
             for name, choices in CHOICES.items()
             if getattr(self, name) not in choices
         ]
-        faults += [text for wrong, text in self._range_faults() if wrong]
+        faults += faults_of(self)
         if faults:
             raise UsageError("the settings of this fit do not hold together", value="; ".join(faults))
 
-    def _range_faults(self) -> list[tuple[bool, str]]:
-        positive = ("steps", "splats", "densify_every", "poses_per_view", "textures_per_view", "texture_window")
-        positive += ("rays", "views_per_step", "coarse", "fine", "width")
-        rates = [f.name for f in fields(self) if f.name.startswith("lr_")]
-        return [
-            *((getattr(self, name) < 1, f"{name} must be at least 1") for name in (*positive, "ratio_instants")),
-            *((not 0 <= getattr(self, name) < 1e6, f"{name} must be 0 or more") for name in rates),
-            *((not 0 <= getattr(self, n) < 1e12, f"{n} must be 0 or more") for n in ("noise", "tfs_weight", "seconds")),
-            (not 0 <= self.sh_degree <= 3, "sh_degree must be 0 to 3"),
-            (self.fresh_poses < 0, "fresh_poses must be 0 (all) or more"),
-            (not 0 < self.init_opacity < 1, "init_opacity must lie between 0 and 1"),
-            (not 0 < self.init_scale < 1e3, "init_scale must be positive"),
-            (not 0 <= self.ssim_weight <= 1, "ssim_weight must be 0 to 1"),
-            (not 0 < self.lr_end <= 1, "lr_end must be in (0, 1]"),
-            *(
-                (not 0 <= getattr(self, n) <= 1, f"{n} is a fraction, 0 to 1")
-                for n in ("ratio_until", "sh_warmup", "densify_until")
-            ),
-            *self._restore_faults(),
-            (self.ratio_eps <= 0, "ratio_eps must be positive"),
-            (not 0 < self.ratio_min <= 1 <= self.ratio_max, "ratio_min <= 1 <= ratio_max must hold"),
-            *self._ray_faults(),
-            (self.pose_label == "first" and self.colour_target == "truth", "the truth is not labelled by pose_label"),
-        ]
-
-    def _restore_faults(self) -> list[tuple[bool, str]]:
-        on = self.restore_instants > 0
-        return [
-            (not 0 <= self.restore_instants <= 99, "restore_instants must be 0 (off) to 99"),
-            (not 0 <= self.restore_from <= 1, "restore_from is a fraction, 0 to 1"),
-            (on and self.ratio_until > 0, "restored instants take the ratio targets' place: ratio_until must be 0"),
-            (on and self.colour_target == "truth", "the truth needs no restoring: restore_instants must be 0"),
-            (on and self.pose_label == "first", "instants are restored about mid-exposure: pose_label must be mid"),
-            (on and self.tfs_weight > 0 and self.textures_per_view > 1, "with restored instants TfS has one texture"),
-            (self.align_arms != "off" and not self.needs_spikes, "without spikes there are no arms to align"),
-        ]
-
-    def _ray_faults(self) -> list[tuple[bool, str]]:
-        if self.field == "splat":
-            return []
-        return [
-            (self.colour_loss != "l2", "a batch of rays has no neighbours for SSIM: colour_loss must be l2"),
-            (self.fresh_poses > 0, "renders of single rays are not remembered: fresh_poses must be 0"),
-            (self.densify != "off", "only splats densify"),
-            (self.views_per_step > self.rays, "views_per_step must not exceed rays"),
-            (max(self.coarse, self.fine, self.width) > 4096, "coarse, fine and width are at most 4096"),
-            (self.rays > 1 << 20, "rays is at most 2^20"),
-            (not 4 <= self.occupancy <= 512, "occupancy must be 4 to 512"),
-        ]
+    @property
+    def moves_cameras(self) -> bool:
+        """Whether training cameras are not those of the scene."""
+        return self.trajectory != "given" or self.pose_noise_deg > 0 or self.pose_noise_share > 0
 
     @property
     def needs_spikes(self) -> bool:
@@ -227,7 +268,9 @@ class FitConfig:
 
     @property
     def needs_trajectory(self) -> bool:
-        """Whether any instant but mid-exposure is rendered."""
+        """Whether any instant but mid-exposure is rendered, from a pose that must be given."""
+        if self.trajectory != "given":
+            return False
         many = self.poses_per_view > 1 and self.ratio_until < 1
         textures = self.tfs_weight > 0 and self.textures_per_view > 1
         ratio = self.ratio_until > 0 and self.ratio_instants > 1

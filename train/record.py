@@ -21,7 +21,8 @@ from spikerig.train.field import Model
 from spikerig.train.fields import field_of
 from spikerig.train.gauge import Gauge
 
-CHECKPOINT, RECORD, HISTORY = "checkpoint.safetensors", "run.json", "history.json"
+DIVERGED = "diverged.safetensors"  # the state before a step that left something not finite
+CHECKPOINT, RECORD, HISTORY, PATHS = "checkpoint.safetensors", "run.json", "history.json", "paths.json"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +64,7 @@ def prepare_folder(out: Path, *, force: bool, resume: bool) -> None:
     Raises:
         UsageError: it holds a run and neither is wanted, or things that are no run.
     """
-    files = [out / name for name in (CHECKPOINT, RECORD, HISTORY)]
+    files = [out / name for name in (CHECKPOINT, RECORD, HISTORY, PATHS)]
     if out.exists() and not out.is_dir():
         raise UsageError("the run's folder is a file", value=out)
     if out.is_dir() and any(out.iterdir()):
@@ -74,6 +75,7 @@ def prepare_folder(out: Path, *, force: bool, resume: bool) -> None:
     if force and not resume:
         for file in files:
             file.unlink(missing_ok=True)
+    (out / DIVERGED).unlink(missing_ok=True)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -21,6 +21,7 @@ from spikerig.train.bridge import Bridge, Cameras, bridge, stored_cameras, true_
 from spikerig.train.field import Model
 from spikerig.train.metrics import SSIM_VARIANTS, rounded
 from spikerig.train.model import BACKGROUNDS, SplatModel
+from spikerig.train.parts import parts_of
 from spikerig.train.quality import Judges, compare, judge_alone, means
 from spikerig.train.realign import STEPS, realign
 from spikerig.train.targets import truth_pose
@@ -255,6 +256,7 @@ def score_run(
         "lpips_variant": judges.about()["lpips"],
         "rounding": metrics.ROUNDING,
         "background": list(BACKGROUNDS[model.config.background]),
+        "remarks": [part.remark for part in parts_of(model.config) if part.remark],
         "method": model.config.method,
         "preset": model.config.preset,
         "field": model.config.field,

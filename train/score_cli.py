@@ -158,4 +158,6 @@ def _tell(result: dict[str, Any]) -> None:
             f"{near['apart_deg_median']:.3f} degrees, {100 * near['apart_share_of_extent_median']:.2f} % of the extent"
         )
         note(f"poses brought over by {near['training_cameras']} training cameras, which are apart by {apart} (medians)")
+    for remark in result["remarks"]:
+        note(f"note: {remark}")
     note(f"method {result['method']}, pose label '{result['pose_label']}', SSIM {result['ssim_variant']}")

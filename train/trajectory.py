@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.errors import DataError, UsageError
-from spikerig.dataset.rigid import between
+from spikerig.dataset.rigid import between, compose, exp_se3
 from spikerig.dataset.scene import Floats, Trajectory, View
+
+if TYPE_CHECKING:
+    from spikerig.train.config import FitConfig
+
+PATH_PHASES = (0.0, 0.25, 0.5, 0.75, 1.0)  # where paths are written down
 
 
 def pose_at(trajectory: Trajectory, at_ns: float) -> Floats:
@@ -69,6 +76,30 @@ def sub_pose(view: View, phase: float) -> Floats:
         expected="poses over the exposure (View.trajectory)",
         next="use --method plain or spikenerf with --pose-label mid, or estimate the trajectory first",
     )
+
+
+def given_pose(view: View, number: int, phase: float, config: FitConfig, scale: float) -> Floats:
+    """The camera [3,4] a fit is given for an instant, before it optimises anything.
+
+    Args:
+        view: a training view.
+        number: of it among them.
+        phase: fraction of its exposure.
+        config: `trajectory` and `path_from` say whether the one mid-exposure pose stands for all instants;
+            `pose_noise_*` spoil what is given, for studies.
+        scale: of the gauge, so that a shift of 1 is half the scene's size.
+
+    Raises:
+        DataError: no pose is known at that instant, and the fit would not find one.
+    """
+    moves = view.trajectory is not None and len(view.trajectory.at_ns) > 1
+    still = config.trajectory != "given" and (config.path_from == "mid" or not moves)
+    pose = sub_pose(view, 0.5 if still else phase)
+    if config.pose_noise_deg == 0 and config.pose_noise_share == 0:
+        return pose
+    size = np.repeat([np.radians(config.pose_noise_deg), config.pose_noise_share / scale], 3)
+    off, drift = np.random.default_rng((config.seed, 8, number)).normal(size=(2, 6))
+    return compose(exp_se3(size * (off if still else off + (phase - 0.5) * drift)), pose)
 
 
 def as_float32(poses: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -15,7 +15,8 @@ from spikerig.dataset.texture import Texture
 from spikerig.train.gauge import Gauge
 from spikerig.train.methods import configure
 from spikerig.train.metrics import psnr
-from spikerig.train.targets import Targets, average_texture, load_targets, spike_tick, windowed_tfi
+from spikerig.train.spikelight import average_texture, spike_tick, windowed_tfi
+from spikerig.train.targets import Targets, load_targets
 
 UNIT = Gauge((0.0, 0.0, 0.0), 1.0)
 
