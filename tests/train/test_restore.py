@@ -170,12 +170,12 @@ def test_unknown_pixels_take_the_frame_s_word(tiny):
 @pytest.mark.parametrize("field", ["splat", "nerf-fast"])
 def test_ours_trains_every_field(tiny, field):
     changes = {"splats": 600} if field == "splat" else {"rays": 64, "fine": 16}
-    config = configure("ours", "draft", field, steps=40, **changes)
+    config = configure("ours", "draft", field, steps=24, **changes)
     with open_scene(tiny) as scene:
         task, record = prepare(scene, tiny, config)
         state = new_state(scene.points, task)
     assert record["renders_per_step"] == {"ratio": 0, "average": 5}
-    losses = [one_step(state, task, k / 40) for k in range(40)]
+    losses = [one_step(state, task, k / 24) for k in range(24)]
     assert np.mean(losses[-5:]) < np.mean(losses[:5])
     assert torch.equal(state.params["restore:flat"], restore.start(task)["flat"])  # not trained
 
