@@ -126,6 +126,9 @@ def test_a_model_that_explains_everything_is_left_alone(tiny):
     view = replace(view, frame=frame, beside=beside)
     made = restore.restored(view, 2, lights, torch.ones(40, 64), task, early=False)
     assert float((linear_from_srgb(made) - lights[2]).abs().max()) < 2e-3
+    doubled = {"instant 2": torch.stack([said * 2, torch.full_like(said, 1e-3), first, last], -1)}
+    keen = restore.restored(replace(view, beside=beside | doubled), 2, lights, torch.full((40, 64), 2.0), task, False)
+    assert float((linear_from_srgb(keen) - lights[2]).abs().max()) < 2e-3  # pixels twice as sensitive
     dark = {"instant 2": torch.stack([said / 2, torch.full_like(said, 1e-3), first, last], -1)}
     halved = restore.restored(replace(view, beside=beside | dark), 2, lights, torch.ones(40, 64), task, early=False)
     assert float((linear_from_srgb(halved) / lights[2]).mean()) == pytest.approx(0.5, abs=0.03)
