@@ -95,6 +95,8 @@ class FitConfig:
     half the scene's size about each axis (standard deviations, drawn by seed and view) are put onto the poses given; at
     the exposure's ends as much again, halved, in opposite directions.
 
+    `colour_weight` scales the colour term; 0 leaves the frames out: textures are all there is (colour spikes).
+
     TfS: `tfs_weight` in the reading `weight_reading` of Eq. TfS (`effective_weight` maps it); textures at
     `textures_per_view` instants, of kind `textures` (`both` = TFP and TFI, averaged to one residual by `tfs_combine`
     average, or two losses by sum; `tfi-window` = TFI over as many intervals as fit into `texture_window` ticks, the
@@ -121,6 +123,15 @@ class FitConfig:
     give. `texture_window` bounds the intervals; with `highlights` keep, light above white is trained from spikes, and
     channels that clip only say "at least". `align_arms` (any method with spikes, train/arms.py): frames are first moved
     onto the spikes by the shift or affine motion that all views together show.
+
+    Baselines (docs/baselines.md): `colour_target` frame, truth, edi (frames deblurred by events: `edi_form` continuous,
+    or binned in `edi_bins`) or restored (by the network `restorer`, which runs only with `trust`; it sees
+    `restorer_frames` views and `restorer_bins` event sums of each, sides padded to multiples of `restorer_pad`, and has
+    `restorer_limit_s` for all). `average_domain`: sub-poses and kernels are averaged as linear light or as encoded
+    codes. `event_weight` of E2NeRF's loss (renders at bin ends against events); `event_light` is what it takes the log
+    of; `event_pos` and `event_neg` are thresholds (0: those recorded); `event_shift` is added to counts, `event_hinge`
+    weighs pixels without events. `kernel_points` of Deblur-NeRF's kernel, from `kernel_start` of the run on, its first
+    point held by `kernel_align`.
     """
 
     field: str = "splat"
@@ -181,6 +192,7 @@ class FitConfig:
     # colour term and camera
     colour_target: str = "frame"
     colour_loss: str = "l1ssim"
+    colour_weight: float = 1.0
     ssim_weight: float = 0.2
     poses_per_view: int = 1
     fresh_poses: int = 0
@@ -194,7 +206,7 @@ class FitConfig:
     knots_at: str = "even"
     path_from: str = "given"
     anchor: str = "mean"
-    lr_poses: float = 1e-3
+    lr_poses: float = 5e-3
     lr_poses_end: float = 0.01
     pose_noise_deg: float = 0.0
     pose_noise_share: float = 0.0
@@ -226,8 +238,8 @@ class FitConfig:
     edi_form: str = "continuous"
     edi_bins: int = 4
     kernel_points: int = 0
-    kernel_start: float = 0.1
-    kernel_align: float = 0.1
+    kernel_start: float = 0.02
+    kernel_align: float = 0.01
     lr_kernel: float = 5e-3
     restorer: str = ""
     trust: bool = False

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from spikerig.dataset.store import SceneFile
     from spikerig.train.config import FitConfig
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating]
 FARTHEST = 30.0  # log light is not followed farther from that of the instant: e^30 is past any sensor's range
 SEARCH = (0.02, 1.0)  # thresholds that are looked through
 LOOKED = 3  # views that the search looks at, spread over the scene
@@ -81,6 +81,8 @@ def view_ratio(scene: SceneFile, view: View, config: FitConfig, thresholds: Thre
     begin, at, end = instants(scene, view, (0.0, phase, 1.0), stream)
     if config.edi_form == "continuous":
         return exposure_ratio(stream, (begin, end), at, thresholds)
+    if phase * config.edi_bins % 1:
+        raise UsageError("mid-exposure is the end of a bin only for even edi_bins", value=config.edi_bins)
     edges = instants(scene, view, [k / config.edi_bins for k in range(config.edi_bins + 1)], stream)
     return binned_ratio(stream.bins(np.array(edges, np.int64)), round(phase * config.edi_bins), thresholds)
 

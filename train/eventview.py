@@ -67,7 +67,7 @@ def thresholds_of(scene: SceneFile, config: FitConfig) -> Thresholds | None:
         DataError: what is recorded makes no sense.
     """
     found = scene.info.get("events")
-    stored = {n: found.get(n) for n in RECORDED} if isinstance(found, dict) else {}
+    stored: dict[str, Any] = {n: found.get(n) for n in RECORDED} if isinstance(found, dict) else {}
     if not all(_sane(value) for value in stored.values()):
         raise DataError(
             "the scene records thresholds of its events that make no sense",

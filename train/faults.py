@@ -23,7 +23,7 @@ def _range_faults(config: FitConfig) -> list[tuple[bool, str]]:
         *((not 0 <= getattr(config, name) < 1e6, f"{name} must be 0 or more") for name in rates),
         *(
             (not 0 <= getattr(config, n) < 1e12, f"{n} must be 0 or more")
-            for n in ("noise", "tfs_weight", "seconds", "densify_grad", "exposure_tv")
+            for n in ("noise", "tfs_weight", "seconds", "densify_grad", "exposure_tv", "colour_weight")
         ),
         (not 0 <= config.sh_degree <= 3, "sh_degree must be 0 to 3"),
         (config.fresh_poses < 0, "fresh_poses must be 0 (all) or more"),
@@ -50,6 +50,8 @@ def _range_faults(config: FitConfig) -> list[tuple[bool, str]]:
         ),
         *_path_faults(config),
         *_baseline_faults(config),
+        (config.colour_weight == 0 and config.tfs_weight == 0, "without frames and textures there is nothing to fit"),
+        (config.colour_weight == 0 and config.ratio_until > 0, "a ratio target needs frames: colour_weight above 0"),
         (config.pose_label == "first" and config.colour_target == "truth", "the truth is not labelled by pose_label"),
     ]
 
@@ -114,39 +116,29 @@ def _path_faults(config: FitConfig) -> list[tuple[bool, str]]:
 
 def _baseline_faults(config: FitConfig) -> list[tuple[bool, str]]:
     numbers = ("event_weight", "event_shift", "event_hinge", "event_pos", "event_neg", "kernel_align")
-    edi_at_mid = config.colour_target == "edi" and config.edi_form == "binned" and config.pose_label == "mid"
+    frames = config.restorer_frames
     return [
         *((not 0 <= getattr(config, n) < 1e3, f"{n} must be 0 to 1000") for n in numbers),
+        (config.average_domain == "encoded" and config.fresh_poses > 0, "fresh_poses remembers linear light"),
         ((config.event_pos > 0) != (config.event_neg > 0), "event_pos and event_neg are given both or not at all"),
-        (
-            config.average_domain == "encoded" and config.fresh_poses > 0,
-            "fresh_poses remembers linear light: use linear",
-        ),
-        (
-            config.event_weight > 0 and config.poses_per_view < 2,
-            "events tie two sub-poses: poses_per_view must be 2 or more",
-        ),
-        (
-            config.event_weight > 0 and config.instants_rule != "endpoints",
-            "events lie between endpoints: instants_rule",
-        ),
-        (
-            config.event_weight > 0 and config.fresh_poses == 1,
-            "events tie two renders of a step: fresh_poses must not be 1",
-        ),
+        *((config.event_weight > 0 and wrong, text) for wrong, text in _event_faults(config)),
         (not 1 <= config.edi_bins <= 1000, "edi_bins must be 1 to 1000"),
-        (edi_at_mid and config.edi_bins % 2 == 1, "mid-exposure is the end of a bin only for even edi_bins"),
         (not 0 <= config.kernel_points <= 64, "kernel_points must be 0 (no kernel) to 64"),
         (not 0 <= config.kernel_start <= 1, "kernel_start is a fraction, 0 to 1"),
         (
             config.kernel_points > 0 and config.poses_per_view > 1,
-            "a kernel stands for the sub-poses: poses_per_view must be 1",
+            "a kernel stands for sub-poses: poses_per_view must be 1",
         ),
-        (
-            not 1 <= config.restorer_frames <= 99 or config.restorer_frames % 2 == 0,
-            "restorer_frames must be odd, 1 to 99",
-        ),
+        (not 1 <= frames <= 99 or frames % 2 == 0, "restorer_frames must be odd, 1 to 99"),
         (not 0 <= config.restorer_bins <= 100, "restorer_bins must be 0 (no events) to 100"),
         (not 1 <= config.restorer_pad <= 256, "restorer_pad must be 1 to 256"),
         (not 0 < config.restorer_limit_s <= 1e6, "restorer_limit_s must be positive"),
+    ]
+
+
+def _event_faults(config: FitConfig) -> list[tuple[bool, str]]:
+    return [
+        (config.poses_per_view < 2, "events tie two sub-poses: poses_per_view must be 2 or more"),
+        (config.instants_rule != "endpoints", "events lie between the ends of bins: instants_rule must be endpoints"),
+        (config.fresh_poses == 1, "events tie two renders of a step: fresh_poses must not be 1"),
     ]

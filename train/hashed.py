@@ -119,7 +119,7 @@ def trace_hashed(
             weights, _ = weights_of(density.reshape(pieces.distance.shape), pieces.length)
             pieces = sample(pieces, weights, LATER_SPREAD, config.fine, rng)
         distance, length = along(pieces.distance, config), pieces.length
-        points = _points(rays, distance)
+    points = _points(rays, distance)  # with the gradient of rays that have one: of poses and kernels that are learned
     density, geometry = density_of(params, config, points.reshape(-1, 3))
     ways = rays.directions[:, None].expand(-1, config.fine, -1).flatten(0, 1)
     colour = colour_of(params, config, geometry, ways)

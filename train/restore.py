@@ -75,9 +75,8 @@ def intervals_at(stream: SpikeStream, tick: float, window: int, straight: Straig
     known = count > 0
     span = np.maximum(last - first, 1)
     variance = ROUNDING / span**2 + 1 / (ELECTRONS * np.maximum(count, 1))
-    maps = [
-        straight.texture(Texture(np.asarray(m, np.float32), known, tick, "")) for m in (light, variance, first, last)
-    ]
+    made = (np.asarray(m, np.float32) for m in (light, variance, first, last))
+    maps = [straight.texture(Texture(m, known, tick, "intervals")) for m in made]
     return Interval(*(np.where(m.known, m.light, np.float32(0)) for m in maps))
 
 

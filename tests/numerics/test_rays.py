@@ -71,6 +71,31 @@ def test_the_grids_gradient_matches_torch_in_float64(isa):
     assert torch.all(table.grad[untouched] == 0)
 
 
+def test_the_gradient_of_places_matches_torch_in_float64():
+    rng = np.random.default_rng(6)
+    points = torch.from_numpy(
+        np.concatenate([awkward_points(rng), rng.uniform(-0.2, 1.2, (500, 3))]).astype(np.float32)
+    )
+    table = torch.from_numpy(table_of(LAYOUT, rng))
+    by = torch.from_numpy(rng.normal(size=(len(points), LAYOUT.width)).astype(np.float32))
+    points.requires_grad_()
+    hash_encode(points, table.clone().requires_grad_(), LAYOUT).backward(by)
+    wide = points.detach().double().requires_grad_()
+    hash_encode_torch(wide, table.double(), LAYOUT).backward(by.double())
+    assert points.grad is not None
+    assert wide.grad is not None
+    off_faces = torch.ones(len(points), dtype=torch.bool)  # float32 and float64 may put a point into other cells
+    for cells in LAYOUT.table[:, 0].tolist():
+        at = points.detach().double().clamp(0, 1) * cells
+        off_faces &= ((at - at.round()).abs() > 1e-4).all(-1)
+    assert off_faces.sum() > 200
+    error = (points.grad.double() - wide.grad)[off_faces].abs().max()
+    assert error < 1e-5 * wide.grad[off_faces].abs().max()
+    outside = (points.detach() < 0) | (points.detach() > 1)
+    assert torch.all(points.grad[outside] == 0)
+    assert torch.isfinite(points.grad).all()
+
+
 def test_the_grid_has_the_same_bits_for_any_thread_count():
     rng = np.random.default_rng(4)
     points = torch.from_numpy(rng.random((5000, 3)).astype(np.float32))

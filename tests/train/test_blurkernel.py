@@ -10,7 +10,7 @@ from spikerig.dataset.store import open_scene
 from spikerig.train import blurkernel
 from spikerig.train.blurkernel import KERNEL, displaced, kernel_at, lattice, mixed, places_of, start, warped
 from spikerig.train.field import Step
-from spikerig.train.fit import new_state, view_loss
+from spikerig.train.fit import load_state, new_state, view_loss
 from spikerig.train.losses import linear_from_srgb, srgb_from_linear
 from spikerig.train.methods import configure
 from spikerig.train.parts import own
@@ -144,19 +144,20 @@ def test_before_its_start_there_is_no_kernel(tiny):
     task, _ = tiny_task(tiny)
     drawn = [torch.rand(40, 64, 3)]
     view = task.targets.views[0]
-    found = KERNEL.draw(start(task), lambda v, p: drawn, view, torch.zeros(3, 4), step(0.09), task)
+    found = KERNEL.draw(start(task), lambda v, p: drawn, view, torch.zeros(3, 4), step(0.019), task)
     assert found is drawn
     state = type("State", (), {"params": {f"kernel:{n}": p for n, p in start(task).items()}})
-    assert KERNEL.loss(state, task, view, {}, step(0.09)) == []
+    assert KERNEL.loss(state, task, view, {}, step(0.019)) == []
     assert KERNEL.loss(state, task, view, {}, step(0.95)) == []
     (align,) = KERNEL.loss(state, task, view, {}, step(0.5))
     moved, origin, _ = kernel_at(start(task), view.which, lattice(8, 8))
-    assert float(align) == pytest.approx(0.1 * float(moved[:, 0].abs().mean() + 10 * origin[:, 0].abs().mean()))
+    assert float(align) == pytest.approx(0.01 * float(moved[:, 0].abs().mean() + 10 * origin[:, 0].abs().mean()))
 
 
-@pytest.mark.parametrize("field", ["splat", "nerf"])
+@pytest.mark.parametrize("field", ["splat", "nerf", "nerf-fast"])
 def test_every_number_of_the_kernel_is_trained(tiny, field):
     small = {} if field == "splat" else {"rays": 32, "coarse": 8, "fine": 8, "width": 16}
+    small |= {"init": "random", "finest": 64, "table_log2": 10} if field == "nerf-fast" else {}
     task, points = tiny_task(tiny, field, **small)
     state = new_state(points, task)
     view = task.field.look(task.targets, task.camera, task.config, 0, np.random.default_rng(0))
@@ -193,14 +194,13 @@ def test_rays_are_traced_from_every_point_of_the_kernel(tiny):
     )
 
 
-def test_it_is_sharper_than_plain_and_the_model_knows_no_kernel(tiny, tmp_path):
-    found = {}
-    for method in ("plain", "deblur"):
-        config = configure(method, "draft", splats=800, steps=300)
-        found[method] = run_fit(tiny, config, tmp_path / method, eval_every=0)["psnr"]
-    assert found["deblur"] > found["plain"] + 0.3
-    model = open_run(tmp_path / "deblur").model
-    assert not any("kernel" in name for name in model.splats.tensors())
+def test_the_finished_model_knows_no_kernel(tiny, tmp_path):
+    done = run_fit(tiny, configure("deblur", "draft", splats=800, steps=60), tmp_path / "run", eval_every=0)
+    assert done["psnr"] > 14
+    state, _ = load_state(tmp_path / "run/checkpoint.safetensors")
+    begun = {f"kernel:{n}": p for n, p in start(tiny_task(tiny)[0]).items()}
+    assert all(not torch.equal(state.params[n], p) for n, p in begun.items())  # it was trained, and kept for --resume
+    assert set(open_run(tmp_path / "run").model.splats.tensors()) == set(state.params) - set(begun)
 
 
 @pytest.mark.parametrize("changes", [{"kernel_points": 65}, {"poses_per_view": 5}, {"kernel_start": 1.5}])

@@ -10,6 +10,7 @@ from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.events import EventStream, no_events
 from spikerig.dataset.images import linear_from_srgb, srgb_from_linear
 from spikerig.dataset.store import open_scene, write_scene
+from spikerig.dataset.texture import tfp
 from spikerig.rigctl.sim.events import EventCamera, simulate_events
 from spikerig.train.deblurred import deblurred, frame_light
 from spikerig.train.edi import binned_ratio, exposure_ratio, searched, sharpened, sparsity
@@ -165,6 +166,27 @@ def test_scenes_that_do_not_fit_are_refused(tiny, tmp_path):
     refused("different clocks", events=lambda e: replace(e, clock="other"))
     refused("do not cover", events=lambda e: e.slice(e.t0_ns, (e.t0_ns + e.t1_ns) // 2))
     refused("no event threshold", events=lambda e: no_events(40, 64, e.t0_ns, e.t1_ns), info={})
+
+
+def test_events_and_spikes_saw_the_same_light(tiny):
+    """Where the events say that light changed by three thresholds or more, spikes changed the same way."""
+    agree = []
+    with open_scene(tiny) as scene:
+        for name in scene.train:
+            view = scene.view(name)
+            begin, end = (view.instant_ns(p) for p in (0.0, 1.0))
+            change = scene.events(name, begin, end).accumulate()
+            first, last = (tfp(view.spikes, view.spikes.tick_at(t), 64).light for t in (begin, end))
+            far = np.abs(change) >= 3
+            agree.append(np.mean((np.sign(change) == np.sign(last - first))[far]))
+    assert np.mean(agree) > 0.95
+
+
+def test_mid_exposure_must_be_the_end_of_a_bin(tiny):
+    with open_scene(tiny) as scene:
+        with pytest.raises(UsageError, match="even edi_bins"):
+            deblurred(scene, configure("edi", "draft", edi_form="binned", edi_bins=5))
+        assert deblurred(scene, configure("edi", "draft", edi_form="binned", edi_bins=5, pose_label="first"))
 
 
 def test_events_on_another_clock_are_mapped(tiny, tmp_path):
