@@ -299,7 +299,7 @@ def test_poses_of_a_transforms_file_are_given_not_estimated(tiny, oracle, tmp_pa
         for kind in ("light", "trajectories", "at_ns")
         if (record := getattr(scene.truth, kind)) is not None
     }
-    alone = replace(scene, views=views, truth=replace(scene.truth, **mine))
+    alone = replace(scene, views=views, events={}, truth=replace(scene.truth, **mine))
     write_scene(tmp_path / "estimated.h5", replace(alone, info={"poses": {"accepted": True}}))
     assert "no training view" in score(capsys, oracle, tmp_path / "estimated.h5", code=4)["error"]["what"]
     write_scene(tmp_path / "given.h5", replace(alone, info={"poses": "transforms_val.json"}))
