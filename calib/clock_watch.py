@@ -16,7 +16,7 @@ FRESH_NS = 5_000_000_000  # without a mark for longer, a clock holds over
 
 
 @dataclass
-class Watch:
+class ClockWatch:
     """A device's clock against the host's, by two-way probes (or arrivals alone) in groups.
 
     Args:

@@ -13,7 +13,7 @@ from spikerig.calib.boards import SMALLEST, Board, Found, find, seen_size
 from spikerig.calib.bundle import Sight
 from spikerig.calib.crop import crop_homography, working_depth_mm
 from spikerig.calib.lens import LENSES
-from spikerig.calib.optics import MirrorHint, RigFit, fit_rig, sight_of
+from spikerig.calib.optics import MirrorHint, RigFit, fit_arms, sight_of
 from spikerig.calib.parity import inverse
 from spikerig.calib.shots import Pair, Reading, content_hash, read_light
 from spikerig.calib.verdict import Seen, Verdict, coverage, judge_fit, judge_views, pair_rms_px, tilt_deg
@@ -106,7 +106,7 @@ def measure(
     model: ModelHint = "auto",
     lenses: Sequence[int] = LENSES,
 ) -> Measured:
-    """Fit and judge what was seen; `mirrored_board` as `look` returns it, the rest as in `fit_rig`."""
+    """Fit and judge what was seen; `mirrored_board` as `look` returns it, the rest as in `fit_arms`."""
     verdict = Verdict()
     used = judge_views(board, seen, verdict)
     known = {"parity": "measured", "arm": "convention"} if mirror == "auto" else {"parity": "given", "arm": "given"}
@@ -120,7 +120,7 @@ def measure(
         mirror = _hint(mirrored_board)
     fit = None
     try:
-        fit = fit_rig(board, _of(seen.spike, used), _of(seen.rgb, used), mirror=mirror, model=model, lenses=lenses)
+        fit = fit_arms(board, _of(seen.spike, used), _of(seen.rgb, used), mirror=mirror, model=model, lenses=lenses)
         if fit.calibration.mirrored and known["arm"] == "convention":
             verdict.warnings.append(
                 "one arm is mirrored, which of them a checkerboard cannot tell: the RGB arm is taken by convention, so "

@@ -69,7 +69,7 @@ def sight_of(found: Sequence[Found | None], board: Board, width: int, height: in
     return Sight(np.where(seen[..., None], px, 0.0), seen, width, height)
 
 
-def fit_rig(
+def fit_arms(
     board: Board,
     spike: Sight,
     rgb: Sight,

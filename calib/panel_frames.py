@@ -17,6 +17,7 @@ from spikerig.dataset.panel import Panel, count_from_gray
 Floats = NDArray[np.float64]
 SURE = 0.1  # an LED lit for less than this share of the exposure counts as off, for more than 1 - this as on
 CONTRAST = 0.02  # of white, between on and off
+HELD = 4  # frames that must show a level before it is believed
 FLOOR = 0.002  # deviation of a share below which nothing is believed: quantisation, stray light
 
 
@@ -74,7 +75,7 @@ def read_frames(
     told: list[Sight] = []
     frames = 0
     banks = _banks(spots, panel)
-    for seen in _blocks(looks, spots, block):
+    for seen in blocks(looks, spots, block):
         frames += len(seen.start_ns)
         for which in banks:
             told += _bank(seen, panel, [spots[k] for k in which], which, row_ns, epoch, ahead_ns)
@@ -86,7 +87,8 @@ def read_frames(
     return sorted(told, key=lambda s: s.device_ns)
 
 
-def _blocks(looks: Iterable[tuple[int, int, NDArray] | Look], spots: Sequence[Spot], size: int) -> Iterator[Seen]:
+def blocks(looks: Iterable[tuple[int, int, NDArray] | Look], spots: Sequence[Spot], size: int) -> Iterator[Seen]:
+    """What is kept of frames, `size` of them at a time; see `read_frames` for the arguments."""
     rows: list[tuple[int, int, Floats, Floats, bool]] = []
     disks: list[tuple[slice, slice, NDArray[np.bool_]]] = []
     for told in looks:
@@ -141,23 +143,23 @@ def _bank(
             expected=f"at most {word_ns / 1e3:.0f} us",
             next="a shorter shutter, or a panel whose slow bits start later",
         )  # fmt: skip
-    found = _shares(seen.light[:, which])
+    found = shares(seen.light[:, which])
     if found is None:
         return []
-    share, contrast = found
+    share, contrast, sure = found
     bit = np.array([panel.leds[s.led].bit for s in spots]) - panel.slow
     inverted = np.array([panel.leds[s.led].inverted for s in spots])
     code = np.where(inverted, 1 - share, share)
     half = (code > SURE) & (code < 1 - SURE)
     sd = np.hypot(seen.noise[:, which] / contrast, FLOOR)
     told = []
-    for frame in np.flatnonzero((half.sum(1) >= 1) & _single(half, bit)).tolist():
+    for frame in np.flatnonzero((half & sure).any(1) & _single(half, bit)).tolist():
         at = int(seen.start_ns[frame])
         edge = _edge(code[frame], half[frame], bit, word_ns, at + ahead_ns)
         if edge is None:
             continue
         panel_ns, bit_on = edge
-        for k in np.flatnonzero(half[frame]).tolist():
+        for k in np.flatnonzero(half[frame] & sure).tolist():
             rising = bit_on ^ bool(inverted[k])
             into = 1 - share[frame, k] if rising else share[frame, k]
             length = float(seen.exposure_ns[frame])
@@ -176,21 +178,30 @@ def _single(half: NDArray[np.bool_], bit: NDArray[np.int64]) -> NDArray[np.bool_
     return low == high
 
 
-def _shares(light: Floats) -> tuple[Floats, Floats] | None:
-    """Light as a share between each LED's off and on; levels of LEDs that never toggle are those of the others."""
+def shares(light: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]] | None:
+    """Light [F,L] as a share between each LED's off and on; None where none blinks.
+
+    Returns:
+        shares [F,L]; on minus off [L]; bool[L], LEDs that show both levels themselves, in several frames each. Those of
+        the others are those of the rest: enough to tell on from off, not to tell how far.
+    """
     low, high = np.percentile(light, (2, 98), axis=0)
-    steady = light[(np.abs(light - low) < 0.05 * (high - low)) | (np.abs(light - high) < 0.05 * (high - low))]
     moving = high - low > max(CONTRAST, 0.5 * float((high - low).max(initial=0)))
-    if not moving.any() or not len(steady):
-        return None
+    sure = np.zeros(len(low), bool)
     for k in np.flatnonzero(moving).tolist():  # medians of what is clearly off or on: extremes would be noise
         middle, span = (low[k] + high[k]) / 2, high[k] - low[k]
         off, on = light[:, k][light[:, k] < middle - 0.4 * span], light[:, k][light[:, k] > middle + 0.4 * span]
         low[k] = np.median(off) if len(off) else low[k]
         high[k] = np.median(on) if len(on) else high[k]
-    low = np.where(moving, low, np.median(low[moving]))
-    high = np.where(moving, high, np.median(high[moving]))
-    return (light - low) / (high - low), high - low
+        sure[k] = all(
+            (np.abs(row - level) <= 0.1 * span).sum() >= HELD for row, level in ((off, low[k]), (on, high[k]))
+        )
+    known = sure if sure.any() else moving
+    if not known.any():
+        return None
+    low = np.where(known, low, np.median(low[known]))
+    high = np.where(known, high, np.median(high[known]))
+    return (light - low) / (high - low), high - low, sure
 
 
 def _edge(

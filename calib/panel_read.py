@@ -108,7 +108,7 @@ class _Reader:
         self.tick_ns = NS / float(stream.rate_hz or 1)
         where = [s.disk(stream.height, stream.width) for s in spots]
         self.pixels = np.array([inside.sum() for *_, inside in where])
-        self.counts = np.stack([_counted(stream, *w) for w in where], 1)  # [T, L]
+        self.counts = np.stack([counted(stream, *w) for w in where], 1)  # [T, L]
         self.sums = np.concatenate([np.zeros((1, len(spots)), np.int64), np.cumsum(self.counts, 0, dtype=np.int64)])
         self.lost = np.zeros(stream.ticks + 1, np.int64)
         for a, b in stream.lost:
@@ -248,7 +248,7 @@ class _Reader:
         )  # fmt: skip
 
 
-def _counted(stream: SpikeStream, rows: slice, columns: slice, inside: NDArray[np.bool_]) -> NDArray[np.int32]:
+def counted(stream: SpikeStream, rows: slice, columns: slice, inside: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Spikes of a spot in every tick."""
     first, last = columns.start // 8, -(-columns.stop // 8)
     mask = np.zeros((inside.shape[0], (last - first) * 8), np.uint8)

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.dataset.errors import DataError, HostError, UsageError
+from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.gopro_file import GoProClip
 from spikerig.dataset.mp4_boxes import damaged, read_movie
+from spikerig.dataset.pyav import pyav
 from spikerig.dataset.scene import Frame
 
 MAX_PIXELS = 64 << 20
@@ -60,7 +60,7 @@ def _frame(clip: GoProClip, number: int, pixels: NDArray[Any]) -> Frame:
 
 def _decoded(path: Path, wanted: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[Any]]]:
     """Frames of one file by their number in the order shown."""
-    av = _av()
+    av = pyav()
     track = next(t for t in read_movie(path).tracks if t.handler == "vide" and len(t.sizes))
     grid = np.sort(track.pts) - track.pts.min()
     try:
@@ -112,14 +112,3 @@ def _pixels(path: Path, frame: Any) -> NDArray[Any]:
 def _check_size(path: Path, width: int, height: int) -> None:
     if not 0 < width * height <= MAX_PIXELS:
         raise DataError("a video of such a size is not read", value=f"{path}: {width} x {height}")
-
-
-def _av() -> ModuleType:
-    try:
-        import av
-    except ImportError as error:
-        raise HostError(
-            "video files need PyAV, which is not installed", cause="the extra 'video' was left out",
-            next='pip install "spikerig[video]"',
-        ) from error  # fmt: skip
-    return av

@@ -176,6 +176,11 @@ class WireBytes:
         self._starts = {e: [c.head.byte_index for c in row] for e, row in self.chunks.items()}
         self._held: tuple[Chunk, NDArray[np.uint8]] | None = None
 
+    @property
+    def profile(self) -> WireProfile:
+        """Of the wire."""
+        return self.take.profile
+
     def span(self, epoch: int) -> tuple[int, int]:
         """First byte, and byte past the last, that an epoch has on disk; (0, 0) where it has none."""
         row = self.chunks.get(epoch, [])

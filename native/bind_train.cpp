@@ -91,7 +91,7 @@ nb::object render_forward(In means, In quats, In log_scales, In logits, In sh, I
 
 void render_backward(Render &render, In means, In quats, In log_scales, In logits, In sh,
                      In image_grad, In alpha_grad, Out g_means, Out g_quats, Out g_log_scales, Out g_logits, Out g_sh,
-                     Out g_means2d, OutDouble g_camera) {
+                     Out g_means2d, OutDouble g_camera, nb::object g_absgrad) {
   spikerig::Frame &f = *render.frame;
   size_t pixels = size_t(f.camera.width) * f.camera.height, n = static_cast<size_t>(f.splats.n);
   const spikerig::Splats splats = splats_of(means, quats, log_scales, logits, sh);
@@ -100,13 +100,19 @@ void render_backward(Render &render, In means, In quats, In log_scales, In logit
              g_sh.size() == sh.size() && g_means2d.size() == 2 * n && g_camera.size() == 12,
          "gradients");
   expect(image_grad.size() == 3 * pixels && alpha_grad.size() == pixels, "pictures");
+  float *absgrad = nullptr;
+  if (!g_absgrad.is_none()) {
+    Out out = nb::cast<Out>(g_absgrad);
+    expect(out.size() == 2 * n, "absgrad");
+    absgrad = out.data();
+  }
   f.splats = splats;
   f.image_grad = image_grad.data();
   f.alpha_grad = alpha_grad.data();
   nb::gil_scoped_release release;
   spikerig::render_backward(f,
                             {g_means.data(), g_quats.data(), g_log_scales.data(), g_logits.data(), g_sh.data(),
-                             g_means2d.data()},
+                             g_means2d.data(), absgrad},
                             g_camera.data());
 }
 
@@ -146,7 +152,8 @@ void bind_train(nb::module_ &m) {
         "camera: fx fy cx cy, cam_from_world[12], near, background[3]. None when a parameter is not finite.");
   m.def("render_backward", &render_backward, "render"_a, "means"_a, "quats"_a, "log_scales"_a, "logits"_a, "sh"_a,
         "image_grad"_a, "alpha_grad"_a, "g_means"_a, "g_quats"_a, "g_log_scales"_a, "g_logits"_a,
-        "g_sh"_a, "g_means2d"_a, "g_camera"_a, "Gradients of the picture render_forward drew.");
+        "g_sh"_a, "g_means2d"_a, "g_camera"_a, "g_absgrad"_a.none(),
+        "Gradients of the picture render_forward drew; g_absgrad: sums over pixels of |d loss / d means2d|, or None.");
   m.def("l1_ssim", &l1_ssim, "image"_a, "target"_a, "valid"_a.none(), "grad"_a.none(), "l1_scale"_a, "ssim_scale"_a,
         "l1_scale * sum |image - target| + ssim_scale * sum (1 - ssim) over valid channels; grad is written.");
 }

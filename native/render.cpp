@@ -138,7 +138,7 @@ void render_backward(Frame &f, const SplatGrads &grads, double *camera_grad) {
   const int64_t n = f.splats.n;
   f.slots.need(f.pairs * SLOT);
   std::memset(f.used.need(f.pairs), 0, f.pairs);
-  parallel(f.tiles_x * f.tiles_y, [&](int tile) { kernel.raster_tile_back(f, tile); });
+  parallel(f.tiles_x * f.tiles_y, [&](int tile) { kernel.raster_tile_back(f, tile, grads.absgrad != nullptr); });
   const int parts = chunks(n);
   f.camera_part.need(static_cast<size_t>(parts) * 15);
   parallel(parts, [&](int part) {

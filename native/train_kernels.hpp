@@ -4,7 +4,7 @@
 //   project     each splat -> Footprint (centre, Cholesky factor of the inverse covariance, colour), tiles it may touch
 //   bin         stable radix sort by depth, then a list of splats for each 16 x 16 tile, front to back
 //   raster      each tile -> colour and transmittance; which blocks of the tile each splat touched
-//   raster_back each tile -> nine sums for each (tile, splat), in a slot of its own
+//   raster_back each tile -> nine sums for each (tile, splat), in a slot of its own; two more where absgrad is asked for
 //   project_back each splat: its slots, summed in tile order -> gradients of its parameters and of the camera
 // Nothing depends on how the work is spread over threads, so the same bits come out for any thread count.
 #pragma once
@@ -27,7 +27,7 @@ constexpr double CLAMP_MARGIN = 0.3;        // the EWA Jacobian is frozen beyond
 constexpr double CULL_MARGIN = 1.0;         // centres beyond the picture plus this x half its size are dropped
 constexpr double LOG_SCALE_MAX = 30.0;      // log scales are clamped to +-this
 constexpr double QUAT_MIN = 1e-24;          // squared length below which a quaternion means "no rotation"
-constexpr int SLOT = 12;                    // floats of a gradient slot; nine are used
+constexpr int SLOT = 12;                    // floats of a gradient slot; nine are used, eleven with absgrad
 constexpr int64_t MAX_PAIRS = int64_t(1) << 31;  // (tile, splat) pairs of a picture
 constexpr int CHUNK = 512;                  // splats of one part
 
@@ -71,6 +71,7 @@ struct Splats {  // float32, C order
 
 struct SplatGrads {
   float *means, *quats, *log_scales, *logits, *sh, *means2d;
+  float *absgrad;  // [n, 2] sums over pixels of |d loss / d means2d|, or null
 };
 
 struct alignas(64) Footprint {
@@ -138,7 +139,7 @@ struct SsimPlan {
   namespace isa {                                                                                                  \
   bool project(Frame &frame, int64_t begin, int64_t end);      /* false: a parameter is not finite */             \
   void raster_tile(Frame &frame, int tile);                                                                        \
-  void raster_tile_back(Frame &frame, int tile);                                                                   \
+  void raster_tile_back(Frame &frame, int tile, bool absgrad);                                                     \
   void project_back(Frame &frame, const SplatGrads &grads, int64_t begin, int64_t end, double *camera_part);       \
   void ssim_band(const SsimPlan &plan, int band, float *scratch, double *sums); /* sums of |.| and of 1 - ssim */ \
   void ssim_band_back(const SsimPlan &plan, int band);                                                             \

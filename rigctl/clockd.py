@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from spikerig.calib.clock_watch import Watch
+from spikerig.calib.clock_watch import ClockWatch
 from spikerig.dataset.clocktime import NS
 from spikerig.dataset.errors import DeviceError, HostError, UsageError
 from spikerig.dataset.marks import Mark, MarkLog, Probe, Reset
@@ -69,7 +69,7 @@ class ClockService:
         stamp_ns: int = 32_000,
     ) -> None:  # fmt: skip
         self._host, self._opener, self._pace = host, opener, pace or Pace()
-        self._watches: dict[str, Watch] = {"box": Watch("box", stamp_ns)}
+        self._watches: dict[str, ClockWatch] = {"box": ClockWatch("box", stamp_ns)}
         self._lock = threading.Lock()  # over the watches and the log: the loop, feeders and askers share them
         self._box: SyncBox | None = None
         self._epochs: dict[int, int] = {}  # ours by the driver's, of the box that is open
@@ -124,7 +124,7 @@ class ClockService:
             groups.setdefault(mark.clock, []).append(mark)
         with self._lock:
             for clock, group in groups.items():
-                self._watches.setdefault(clock, Watch(clock)).add(group)
+                self._watches.setdefault(clock, ClockWatch(clock)).add(group)
                 self._store(group)
 
     def status(self) -> dict[str, Any]:

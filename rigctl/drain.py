@@ -26,6 +26,7 @@ class Drain:
         acknowledged: called when a chunk is on disk.
         lost: called with a buffer that could not be written.
         failed: called once, with the words and the exception.
+        look: called with each buffer, written or not wanted; None: nobody looks.
 
     Attributes:
         number: of the next chunk.
@@ -41,9 +42,11 @@ class Drain:
         acknowledged: Callable[[ChunkHead, Path, int], None],
         lost: Callable[[Slot], None],
         failed: Callable[[str, Exception], None],
+        look: Callable[[Slot], None] | None = None,
     ) -> None:
         self.ring, self.writer, self.take, self.number, self.tick_bytes = ring, writer, take, first, tick_bytes
         self._acknowledged, self._lost, self._failed = acknowledged, lost, failed
+        self._look = look
         self._broken = False
         self._thread = threading.Thread(target=self._run, name="spike-writer", daemon=True)
 
@@ -68,7 +71,10 @@ class Drain:
                 if self._broken:
                     self._lost(slot)
                 else:
-                    self._put(slot)
+                    if slot.wanted:
+                        self._put(slot)
+                    if self._look is not None:
+                        self._look(slot)
             except Exception as error:  # also a fault of ours: it must not leave a silent thread behind
                 self._broken = True
                 self._lost(slot)

@@ -15,6 +15,8 @@ from spikerig.rigctl.profiles import check_link
 from spikerig.rigctl.ring import ring_slots
 from spikerig.rigctl.take_plan import TakePlan
 
+PERIODS = 1.6  # of a plain LED that a viewpoint must hold
+
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
@@ -75,6 +77,7 @@ def forecast(plan: TakePlan, out: Path, *, done: int = 0, memory: int | None = N
     card = round(plan.rgb.card_gb * 1e9)
     if plan.rgb.use and card and card < left * clip:
         cannot.append(_lacks("the RGB camera's card", round(left * clip), card, "an empty card, fewer viewpoints"))
+    cannot += _optical(plan)
     wait = plan.settle_s if plan.advance == "auto" else 0.0
     seconds = left * (plan.seconds + (2 * plan.rgb.lead_s if plan.rgb.use else 0.0) + wait)
     room = [] if free is None else [f"the disk: full after {max(0, free) / max(wire.bytes_s, 1):.0f} s of spikes"]
@@ -82,8 +85,29 @@ def forecast(plan: TakePlan, out: Path, *, done: int = 0, memory: int | None = N
         per_view, left * per_view, round(left * clip), seconds, wire.bytes_s, wire.link_bytes_s, ring, free,
         tuple(e.as_json() for e in cannot),
         (f"the link: {wire.link_bytes_s / 1e6:.0f} MB/s, the camera makes {wire.bytes_s / 1e6:.0f}", *room,
-         f"the ring: {plan.recorder.ring_s:g} s without the disk"),
+         f"the ring: {plan.recorder.ring_s:g} s without the disk", *_beats(plan)),
     )  # fmt: skip
+
+
+def _optical(plan: TakePlan) -> list[RigError]:
+    """Why the LED of a plan without a clock box cannot do."""
+    if plan.sync.mode != "optical":
+        return []
+    if not plan.rgb.use:
+        return [UsageError("optical sync ties the spikes to an RGB camera, and the plan uses none", value="rgb.use",
+                           next='rgb.use = true, or sync.mode = "none"')]  # fmt: skip
+    period = (plan.led.period_ms if plan.led else 0.0) / 1e3
+    if plan.seconds < PERIODS * period:
+        return [UsageError("viewpoints are too short for the LED", value=f"{plan.seconds:g} s",
+                           expected=f"at least {PERIODS} periods, {PERIODS * period:.2f} s")]  # fmt: skip
+    return []
+
+
+def _beats(plan: TakePlan) -> list[str]:
+    """What the LED's period must be."""
+    if plan.sync.mode != "optical":
+        return []
+    return ["the LED: its period must exceed what a clip's start and stop leave open, some 0.2 to 0.35 s by Bluetooth"]
 
 
 def _lacks(what: str, needed: int, free: int, next: str) -> UsageError:

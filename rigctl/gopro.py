@@ -17,7 +17,7 @@ from spikerig.rigctl.devices import Clip, DeviceFacts
 from spikerig.rigctl.gopro_http import ADDRESS, Dark, Media, Web, Wifi
 from spikerig.rigctl.gopro_radio import BleLink, Radio
 from spikerig.rigctl.gopro_settle import settle
-from spikerig.rigctl.gopro_watch import Watch
+from spikerig.rigctl.gopro_watch import GoProWatch
 from spikerig.rigctl.host import Host
 
 _WAKING = 5  # s that a camera may take to wake
@@ -44,7 +44,7 @@ class GoProSource:
     ) -> None:  # fmt: skip
         self.host, self.web, self.radio, self.say = host, web, radio, say
         self.facts = facts or identify(host, web, radio)
-        self._watch = Watch(host, web, radio, patience_s)
+        self._watch = GoProWatch(host, web, radio, patience_s)
         self._started: tuple[int, int] | None = None
         self._before: set[str] = set()
         self._turbo = False

@@ -9,10 +9,10 @@ from spikerig.dataset.errors import DeviceError
 from spikerig.rigctl.gopro_http import Dark, Web
 from spikerig.rigctl.gopro_radio import Radio
 from spikerig.rigctl.gopro_settings import BY_NAME, DEFAULTS, Setting, in_order
-from spikerig.rigctl.gopro_watch import Watch
+from spikerig.rigctl.gopro_watch import GoProWatch
 
 
-def settle(watch: Watch, settings: Mapping[str, Any]) -> dict[str, dict[str, str]]:
+def settle(watch: GoProWatch, settings: Mapping[str, Any]) -> dict[str, dict[str, str]]:
     """Bring the camera to the rig's settings, changed by `settings`; see gopro_settings.py for the names.
 
     Returns:
@@ -40,7 +40,7 @@ def settle(watch: Watch, settings: Mapping[str, Any]) -> dict[str, dict[str, str
     return done
 
 
-def _stop_hindsight(watch: Watch) -> None:
+def _stop_hindsight(watch: GoProWatch) -> None:
     """HindSight encodes all the time: until it is off, HTTP is dark and every other setting is refused."""
     hindsight = BY_NAME["hindsight"]
     off = hindsight.options["off"]
@@ -70,7 +70,7 @@ def _refused(web: Web, radio: Radio | None, setting: Setting, value: int) -> Dev
     )  # fmt: skip
 
 
-def _read_back(watch: Watch, done: Mapping[str, str], chosen: list[tuple[Setting, str, int]]) -> None:
+def _read_back(watch: GoProWatch, done: Mapping[str, str], chosen: list[tuple[Setting, str, int]]) -> None:
     wanted = {s.number: (s.name, option, value) for s, option, value in chosen if s.name in done}
     found = watch.radio.settings(wanted) if watch.radio is not None else watch.web.state()[1]
     wrong = [

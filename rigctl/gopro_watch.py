@@ -20,7 +20,7 @@ _CARD = {1: "the card is full", 2: "there is no card", 3: "the card must be form
 
 
 @dataclass
-class Watch:
+class GoProWatch:
     """The camera's statuses over Bluetooth, or over HTTP where there is none.
 
     Args:

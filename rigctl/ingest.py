@@ -11,21 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.build import area_resize
-from spikerig.dataset.clocktime import NS, ClockModel
+from spikerig.dataset.clocktime import NS, ClockModel, tick_from_ns
 from spikerig.dataset.errors import DataError, RefusedError
 from spikerig.dataset.gopro_file import GoProClip, open_gopro
 from spikerig.dataset.gopro_pictures import read_pictures
 from spikerig.dataset.images import linear_from_srgb, srgb8_from_linear
+from spikerig.dataset.marks import Sight
 from spikerig.dataset.rawtake import RawTake, TakenView, WireBytes, open_take
 from spikerig.dataset.scene import Camera, Frame, Pose, View
 from spikerig.dataset.store_write import SceneWriter
 from spikerig.dataset.stream import SpikeStream
 from spikerig.dataset.wire import WireProfile
 from spikerig.dataset.wire_ticks import ticks_from_wire
-from spikerig.rigctl.ingest_sights import panel_mask, panel_pairs, sights
-from spikerig.rigctl.ingest_slips import MendedBytes
+from spikerig.rigctl.ingest_led import LedSights, led_sights
+from spikerig.rigctl.ingest_sights import panel_in_view, panel_mask, sights
+from spikerig.rigctl.ingest_slips import mended
 from spikerig.rigctl.ingest_times import LATE_TICKS, Framing, Times, read_truth
 from spikerig.rigctl.ingest_truth import TrueWorld
+from spikerig.rigctl.led_view import led_plan
 
 MARGIN_TICKS = 256
 
@@ -95,14 +98,21 @@ def ingest(
         raise DataError("the take has no viewpoint that was kept", value=take.folder)
     truth = read_truth(take)
     times = Times(take, truth)
-    wire = MendedBytes(take, [s for v in views for s in v.spikes])
-    views = [replace(v, spikes=tuple((e, wire.sent(e, a), wire.sent(e, b)) for e, a, b in v.spikes)) for v in views]
-    framing = Framing(wire, [s for v in views for s in v.spikes], panel_pairs(take))
+    wire, views = mended(take, views)
+    panel, led = panel_in_view(take.plan), led_plan(take.plan)
+    framing = Framing(wire, [s for v in views for s in v.spikes], panel.pairs if panel else ())
     wanted = bool(truth) if config.truth is None else config.truth
-    world = TrueWorld(take, times, truth) if wanted else None
-    seen, times.missing = sights(take, views, times.clocks, wire, framing, begin("reading the panel", len(views)))
+    blinked: LedSights | None = None
+    seen: list[Sight] = []
+    done = begin("reading the panel" if led is None else "reading the LED", len(views))
+    if led is not None:
+        blinked = led_sights(take, views, led, times.marks, wire, framing, done)
+        seen, times.missing = blinked.sights, blinked.missing
+    elif panel is not None:
+        seen, times.missing = sights(take, views, panel, times.marks, wire, framing, done)
     if seen:
         times.fit(seen)
+    world = TrueWorld(take, times, truth) if wanted else None
     size = take.profile
     camera = world.camera if world else Camera.pinhole(size.width, size.height, config.fov_deg)
     held = _held_out(take, config)
@@ -110,6 +120,7 @@ def ingest(
     told: dict[str, Any] = {
         "views": 0, "test": [], "left_out": {}, "lost_ticks": 0, "sigma_us": 0.0, "rgb_times": {},
         "sights": len(seen), "panel_unread": times.missing, "slips": [asdict(s) for s in wire.slips],
+        "led": None if blinked is None else blinked.as_json(),
     }  # fmt: skip
     done = begin("cutting", len(views))
     hidden = panel_mask(take)
@@ -125,13 +136,14 @@ def ingest(
             for number, cut in enumerate(cuts):
                 name = view.name if config.frames == 1 else f"{view.name}-{number}"
                 split = "test" if view.name in held else "train"
-                _add(writer, _plain(name, cut, split, hidden), view, cut, world, told)
+                dark = blinked.hidden(view.name, size.height, size.width) if blinked else hidden
+                _add(writer, _plain(name, cut, split, dark), view, cut, world, told)
             done()
         if not told["views"]:
             raise DataError("no view can be made of this take", value="; ".join(
                 dict.fromkeys(told["left_out"].values())))  # fmt: skip
         info["clocks"]["rgb"] = told["rgb_times"]
-        writer.info = {**info, "left_out": told["left_out"], "slips": told["slips"]}
+        writer.info = {**info, "left_out": told["left_out"], "slips": told["slips"], "led": told["led"]}
         if world:
             writer.points = world.points()
     return {"scene": str(out), **told}
@@ -166,6 +178,8 @@ def cut_view(
 ) -> list[Cut]:
     """The frames nearest the middle of a viewpoint whose exposures its spikes cover, with those spikes.
 
+    A frame of whose exposure no tick is left says nothing: the next one is taken.
+
     Raises:
         DataError: no clip, no such frame, or damaged files.
         RefusedError: clocks or framing cannot be told.
@@ -187,18 +201,27 @@ def cut_view(
     spike = times.spike(epoch, device_ns(profile, start))
     rig_of = _tick_times(profile, spike, offset)
     begin, end = (int(t) for t in rig_of(np.array([first, last])))
-    chosen = _frames(clip, rgb, begin, end, config, profile, spike, view.name)
-    cuts = []
-    for number, frame in read_pictures(clip, chosen):
-        starts = int(rgb.rig_from_device(frame.start_ns))
-        ends = starts + frame.exposure_ns + round(clip.row_ns * (clip.height - 1))
-        margin = _margin_ns(config, profile, spike, rgb, frame.start_ns, device_ns(profile, start))
+    likely = _frames(clip, rgb, begin, end, config, profile, spike, view.name)
+    found: dict[int, tuple[SpikeStream, float]] = {}
+    for number in likely:
+        media = int(clip.start_ns[number])
+        starts, ends = (int(t) for t in _exposed(clip, rgb, np.array([number]))[:, 0])
+        margin = _margin_ns(config, profile, spike, rgb, media, device_ns(profile, start))
         t0 = max(first, int(np.floor(_tick_at(rig_of, first, last, starts - margin))))
         t1 = min(last, int(np.ceil(_tick_at(rig_of, first, last, ends + margin))))
-        sigma = float(np.hypot(spike.sigma_at(device_ns(profile, start)), rgb.sigma_at(int(clip.start_ns[number]))))
-        rows = (np.arange(profile.height, dtype=np.float32) + 0.5) * (clip.height / profile.height) - 0.5
         spikes = _spikes(wire, epoch, offset, t0, t1, rig_of)
-        cuts.append(Cut(_sized(frame, starts, profile), rows, spikes, sigma, tied.how))
+        if not _blind(spikes, starts, ends):
+            sigma = float(np.hypot(spike.sigma_at(device_ns(profile, start)), rgb.sigma_at(media)))
+            found[number] = spikes, sigma
+        if len(found) == config.frames:
+            break
+    if not found:
+        raise DataError("every tick of its exposures is lost", value=f"{view.name}, {len(likely)} frames")
+    cuts = []
+    for number, frame in read_pictures(clip, sorted(found)):
+        rows = (np.arange(profile.height, dtype=np.float32) + 0.5) * (clip.height / profile.height) - 0.5
+        starts = int(rgb.rig_from_device(frame.start_ns))
+        cuts.append(Cut(_sized(frame, starts, profile), rows, *found[number], tied.how))
     return cuts
 
 
@@ -234,12 +257,9 @@ def _frames(
     clip: GoProClip, rgb: ClockModel, begin: int, end: int, config: IngestConfig, profile: WireProfile,
     spike: ClockModel, name: str,
 ) -> list[int]:  # fmt: skip
-    """Numbers of the frames that the spikes cover with margins, the nearest to the middle."""
-    if clip.exposure_ns is None or clip.row_ns is None:
-        return []
+    """Numbers of the frames that the spikes cover with margins, the nearest to the middle first."""
     margin = round(config.margin_ticks / profile.rate_hz * NS)
-    starts = rgb.rig_from_device(clip.start_ns)
-    ends = starts + clip.exposure_ns + round(clip.row_ns * (clip.height - 1))
+    starts, ends = _exposed(clip, rgb, np.arange(clip.frames))
     good = np.flatnonzero((starts - margin >= begin) & (ends + margin <= end))
     if not len(good):
         raise DataError(
@@ -249,7 +269,23 @@ def _frames(
             cause="too short a viewpoint, or clocks that are off",
         )  # fmt: skip
     apart = np.abs((starts + ends)[good] // 2 - (begin + end) // 2)
-    return sorted(int(k) for k in good[np.argsort(apart, kind="stable")[: config.frames]])
+    return [int(k) for k in good[np.argsort(apart, kind="stable")]]
+
+
+def _exposed(clip: GoProClip, rgb: ClockModel, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+    """When frames begin to be exposed, and when their last row ends, int64[2,N] of rig time."""
+    starts = rgb.rig_from_device(clip.start_ns[numbers])
+    exposure = np.zeros(clip.frames, np.int64) if clip.exposure_ns is None else clip.exposure_ns
+    return np.stack([starts, starts + exposure[numbers] + round((clip.row_ns or 0.0) * (clip.height - 1))])
+
+
+def _blind(spikes: SpikeStream, starts: int, ends: int) -> bool:
+    """Whether no tick between two times is left."""
+    a, b = np.clip(tick_from_ns([starts, ends], float(spikes.rate_hz or 1), spikes.t0_ns), 0, spikes.ticks)
+    gone = np.zeros(spikes.ticks, bool)
+    for m, n in spikes.lost:
+        gone[m:n] = True
+    return bool(gone[int(a) : int(np.ceil(b))].all())
 
 
 def _sized(frame: Frame, start_ns: int, profile: WireProfile) -> Frame:

@@ -1,149 +1,16 @@
-"""Losses that time could not see: bytes that left a stream in its middle, told from where ticks begin, and mended."""
+"""Small losses put back: a take's bytes numbered as the camera sent them, though time saw none of them missing."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spikerig.dataset.errors import DataError
-from spikerig.dataset.framing import FEWEST, find_phase, rates_at, seam_scores
-from spikerig.dataset.rawtake import RawTake, WireBytes, read_lines
-
-LOOK_TICKS, EVERY_TICKS = 32, 128  # of a look, and between two
-SEAM_TICKS = 256  # of a stretch whose edges are looked at
-LEAST_GAIN = 8.0  # nats by which the edges must have moved
-MOST_STRETCHES = 16  # on each side
-SURE = 0.999
-
-Spans = Sequence[tuple[int, int, int]]
-
-
-@dataclass(frozen=True, slots=True)
-class Missing:
-    """Bytes that are not in the stream though nothing said so.
-
-    Args:
-        epoch: of the stream.
-        after, before: the loss lies between these bytes that came.
-        lost: how many bytes, less whole ticks: those cannot be told.
-    """
-
-    epoch: int
-    after: int
-    before: int
-    lost: int
-
-
-def find_slips(wire: WireBytes, spans: Spans) -> list[Missing]:
-    """Small losses within viewpoints, in order.
-
-    Args:
-        wire: the bytes as they came.
-        spans: (epoch, first byte, byte past the last) of viewpoints.
-
-    Edges:
-        A picture that moves by a row looks like a loss of a row's bytes. So without tags a shift is believed only
-        where it comes at once, within some 3 ms; and one of whole rows (a byte more or less) only where the picture's
-        edges moved, too. Whole ticks that are lost move nothing: only time can tell them. Losses between viewpoints
-        are not looked for: framing that differs between viewpoints is refused by `Framing`.
-
-    Cost:
-        A look of 32 ticks every 128: a quarter of the bytes is looked at, about 15 ms a look at 400x250.
-    """
-    found: list[Missing] = []
-    size = wire.take.profile.tick_bytes
-    for epoch, start, stop in sorted(set(spans)):
-        begin = -(-start // size) * size
-        looks = list(range(begin, stop - LOOK_TICKS * size, EVERY_TICKS * size))
-        if len(looks) > 1:
-            looks.append((stop // size - LOOK_TICKS) * size)
-        after = begin
-        for a, b in pairwise(looks):
-            if a < after or not _shift(wire, epoch, a, b):
-                continue
-            slip = _narrow(wire, epoch, a, b)
-            sure = None if slip is None else _settled(wire, slip[0], spans, slip[1])
-            if sure is not None:
-                found.append(sure)
-                after = sure.before
-    return found
-
-
-def _shift(wire: WireBytes, epoch: int, first: int, second: int) -> int:
-    """By how many bytes ticks surely begin later in a second look than in a first; 0 where it cannot be told."""
-    profile = wire.take.profile
-    room = LOOK_TICKS * profile.tick_bytes
-    (one, gone), (two, lost) = (wire.read(epoch, at, at + room) for at in (first, second))
-    if gone or lost:
-        return 0
-    if profile.framing == "m1k40":
-        was, now = find_phase(one, profile), find_phase(two, profile)
-        return (now.offset - was.offset) % profile.tick_bytes if min(was.confidence, now.confidence) > SURE else 0
-    phase = find_phase(two, profile, like=rates_at(one, profile, 0))
-    return phase.offset if phase.confidence > SURE else 0
-
-
-def _narrow(wire: WireBytes, epoch: int, first: int, second: int) -> tuple[Missing, int] | None:
-    """The loss between two looks and its shift, by halves; None where the shift comes bit by bit: a moving picture."""
-    size = wire.take.profile.tick_bytes
-    room = LOOK_TICKS * size
-    while second - first > room:
-        mid = first + (second - first) // (2 * size) * size
-        first, second = (first, mid) if _shift(wire, epoch, first, mid) else (mid, second)
-    # a look in the loss itself sees both framings: the ones on either side of it see one each
-    first, second = first - room // 2 // size * size, second + room // 2 // size * size
-    shift = _shift(wire, epoch, max(first, 0), second)
-    if not shift:
-        return None
-    return Missing(epoch, max(first, 0) + room // 2 // size * size, second + room, size - shift), shift
-
-
-def _settled(wire: WireBytes, slip: Missing, spans: Spans, shift: int) -> Missing | None:
-    """The loss with its size made sure by the picture's edges, which stay where they are when the picture moves.
-
-    None where it may as well be a picture that moved by whole rows, one byte more or less.
-    """
-    profile = wire.take.profile
-    size, row = profile.tick_bytes, profile.row_bits // 8
-    if profile.framing == "m1k40":
-        return slip
-    if not 1 < shift % row < row - 1:
-        return slip if _edges_moved(wire, slip, spans, shift) else None
-    mine = [(a, b) for e, a, b in sorted(set(spans)) if e == slip.epoch]
-    first = _edges(wire, slip.epoch, [(a, min(b, slip.after)) for a, b in mine][::-1])
-    second = _edges(wire, slip.epoch, [(max(a, slip.before), b) for a, b in mine])
-    likely = {by: float(np.max(first + np.roll(second, -by))) for by in (shift - row, shift, shift + row)}
-    by = max(likely, key=likely.__getitem__)
-    return replace(slip, lost=(size - by) % size)
-
-
-def _edges_moved(wire: WireBytes, slip: Missing, spans: Spans, shift: int) -> bool:
-    """Whether the picture's edges surely went with a shift, in the nearest stretches on either side."""
-    size = wire.take.profile.tick_bytes
-    a, b = next((a, b) for e, a, b in spans if e == slip.epoch and a <= slip.after and slip.before <= b)
-    room = (SEAM_TICKS + 1) * size
-    first = _edges(wire, slip.epoch, [(max(a, slip.after - room), slip.after)])
-    second = _edges(wire, slip.epoch, [(slip.before, min(b, slip.before + room))])
-    return float(np.max(first + np.roll(second, -shift)) - np.max(first + second)) > LEAST_GAIN
-
-
-def _edges(wire: WireBytes, epoch: int, spans: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
-    """Scores of every byte to begin a tick, over some stretches of one side of a loss."""
-    profile = wire.take.profile
-    size = profile.tick_bytes
-    total = np.zeros(size)
-    left = MOST_STRETCHES
-    for start, stop in spans:
-        for at in range(-(-start // size) * size, stop - FEWEST * size, SEAM_TICKS * size):
-            data, missing = wire.read(epoch, at, min(at + SEAM_TICKS * size, stop))
-            if left and not missing and len(data) >= FEWEST * size:
-                total += seam_scores(data, profile)
-                left -= 1
-    return total
+from spikerig.dataset.rawtake import RawTake, TakenView, WireBytes, read_lines
+from spikerig.rigctl.slips import Missing, Spans, find_slips
 
 
 class MendedBytes(WireBytes):
@@ -200,6 +67,14 @@ class MendedBytes(WireBytes):
         end, bytes_ = self._doubtful.get(epoch, (0, 0))
         first, last = max(start, self.sent(epoch, end) - bytes_), min(stop, self.sent(epoch, end))
         return found + ([(first, last)] if first < last else [])
+
+
+def mended(take: RawTake, views: Sequence[TakenView]) -> tuple[MendedBytes, list[TakenView]]:
+    """A take's bytes with small losses put back, and its viewpoints with spans in bytes as the camera sent them."""
+    wire = MendedBytes(take, [s for v in views for s in v.spikes])
+    return wire, [
+        replace(v, spikes=tuple((e, wire.sent(e, a), wire.sent(e, b)) for e, a, b in v.spikes)) for v in views
+    ]
 
 
 def _doubtful_ends(take: RawTake) -> dict[int, tuple[int, int]]:

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from spikerig.calib.clock import fit_rig
 from spikerig.calib.clock_maps import Clocks
 from spikerig.calib.panel_read import Spot
-from spikerig.dataset.clocktime import ClockModel
+from spikerig.dataset.clocktime import NS, ClockModel
 from spikerig.dataset.errors import DataError, RefusedError
-from spikerig.dataset.framing import find_phase
+from spikerig.dataset.framing import confidence_of, find_phase, seam_scores
 from spikerig.dataset.gopro_file import GoProClip
 from spikerig.dataset.marks import Sight, read_marks
-from spikerig.dataset.rawtake import RawTake, WireBytes
+from spikerig.dataset.rawtake import RawTake, WireBytes, read_lines
 from spikerig.rigctl.panel_framing import MOST_TICKS, best_of, panel_scores
 
 LATE_TICKS = 1  # a tick's bytes leave during the tick after it was exposed (assumed: docs/hardware/vidar.md)
@@ -75,7 +75,7 @@ class Times:
         number = clip_number(name)
         if ("rgb", number) in self.sighted:
             return RgbTimes(self.clocks.fit("rgb", number, int(clip.start_ns[0])).model, "sights")
-        found = [
+        found = [] if self.take.plan.get("sync", {}).get("mode") == "optical" else [
             (session, row)
             for session in self.truth
             for row in session.get("rgb", ())
@@ -85,8 +85,8 @@ class Times:
         if not found:
             raise RefusedError(
                 "nothing ties this clip's frames to the rig's time", value=name,
-                expected="the LED panel in its view, read into marks.jsonl",
-                next="spikerig rig panel TAKE SPOTS.json reads it; without it frames and spikes cannot be paired",
+                expected="the LED panel, or the LED, in its view",
+                next="spikerig rig panel TAKE SPOTS.json reads a panel; without it frames and spikes cannot be paired",
             )  # fmt: skip
         session, row = found[-1]
         media, true = np.array(row["media_ns"], np.int64), np.array(row["true_ns"], np.int64)
@@ -94,22 +94,39 @@ class Times:
         return RgbTimes(ClockModel(media, rig, np.full(len(media), 1000.0)), "truth")
 
     def rig_from_true(self, session: Mapping[str, Any], true_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Rig time at true times of an emulated session with a clock box."""
-        box = session.get("box")
-        if self.clocks.rig != "box" or not box:
-            raise RefusedError("an emulated take without a clock box has no truth in rig time", value=self.clocks.rig)
-        knots = np.array(box["clock"], np.int64)
-        return ClockModel(knots[:, 0], knots[:, 1] - self.clocks.origin_ns, np.zeros(len(knots))).rig_from_device(
-            true_ns
-        )
+        """Rig time at true times of an emulated session.
+
+        Raises:
+            RefusedError: the session does not tell: without a clock box, one of several epochs of the spike stream.
+        """
+        return self._true_model(session).rig_from_device(true_ns)
 
     def true_from_rig(self, session: Mapping[str, Any], rig_ns: NDArray[np.int64]) -> NDArray[np.int64]:
         """The way back."""
         return self._true_model(session).device_from_rig(rig_ns)
 
     def _true_model(self, session: Mapping[str, Any]) -> ClockModel:
-        knots = np.array(session["box"]["clock"], np.int64)
-        return ClockModel(knots[:, 0], knots[:, 1] - self.clocks.origin_ns, np.zeros(len(knots)))
+        box = session.get("box")
+        if self.clocks.rig == "box" and box:
+            knots, off = np.array(box["clock"], np.int64), 0
+        else:
+            knots, off = (
+                np.array(session.get("spike_clock") or (), np.int64).reshape(-1, 2),
+                self._stream_began(session),
+            )
+        return ClockModel(knots[:, 0], knots[:, 1] - np.int64(off + self.clocks.origin_ns), np.zeros(len(knots)))
+
+    def _stream_began(self, session: Mapping[str, Any]) -> int:
+        """The camera's own time at the first byte of the epoch, of a take of one session and one epoch."""
+        ends = [told for _, told in read_lines(self.take.folder / "log.jsonl") if told.get("kind") == "end"]
+        if len(ends) != 1 or ends[0].get("epoch") != 0 or not session.get("spike_clock"):
+            raise RefusedError(
+                "an emulated take without a clock box tells its truth of one epoch only", value=self.clocks.rig,
+                next="--no-truth",
+            )  # fmt: skip
+        profile = self.take.profile
+        first = int(session["spike"][0]["sent"][-1][1]) - int(ends[0]["bytes"])
+        return round(first / profile.tick_bytes / profile.rate_hz * NS)
 
 
 def clip_number(name: str) -> int:
@@ -183,14 +200,23 @@ class Framing:
                 yield start, data
 
     def _by_seam(self, epoch: int) -> int | None:
-        sure = set()
+        sure: set[int] = set()
+        size = self.profile.tick_bytes
+        total = np.zeros(size)
         for start, data in self._stretches(epoch):
-            phase = find_phase(data[: PHASE_TICKS * self.profile.tick_bytes], self.profile)
+            piece = data[: PHASE_TICKS * size]
+            phase = find_phase(piece, self.profile)
             if phase.confidence >= SURE:
-                sure.add((start + phase.offset) % self.profile.tick_bytes)
+                sure.add((start + phase.offset) % size)
             if len(sure) == 1 and phase.confidence > VERY_SURE:
                 break
-        return sure.pop() if len(sure) == 1 else None
+            if self.profile.framing == "none":
+                total += np.roll(seam_scores(piece, self.profile), start % size)
+        if sure:
+            return sure.pop() if len(sure) == 1 else None
+        # no picture tells by itself: what all of them say together, if it is said clearly
+        best = int(np.argmax(total))
+        return best if confidence_of(total, best) > VERY_SURE else None
 
     def _by_panel(self, epoch: int) -> int | None:
         total = np.zeros(self.profile.tick_bytes)

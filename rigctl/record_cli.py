@@ -74,7 +74,8 @@ def record(
     read = load_plan(plan)
     told = forecast(read, out)
     if told.cannot:
-        raise UsageError("this plan cannot be recorded here", value="; ".join(r["what"] for r in told.cannot),
+        reasons = "; ".join(f"{r['what']}: {r['value']}, needs {r['expected']}" for r in told.cannot)
+        raise UsageError("this plan cannot be recorded here", value=reasons,
                          next=f"spikerig rig plan {plan} -o {out}")  # fmt: skip
     rig = open_rig(read, out, emulate, resume)
     try:

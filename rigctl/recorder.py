@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,54 +15,18 @@ from spikerig.dataset.segments import PAGE, ChunkHead, chunk_ticks, padded
 from spikerig.rigctl.devices import Block, SpikeSource
 from spikerig.rigctl.drain import Drain
 from spikerig.rigctl.host import Host
+from spikerig.rigctl.looks import Looks
+from spikerig.rigctl.numbering import FRAMING, Numbering
+from spikerig.rigctl.recorder_options import RecorderOptions, RecorderState
 from spikerig.rigctl.ring import Ring, Slot, ring_slots
 from spikerig.rigctl.segment_writer import SegmentWriter
+from spikerig.rigctl.stream_notes import Glimpse, Progress
 
 TIMEOUT_NS = 100_000_000  # of one read
 SILENT_NS = 2_000_000_000  # without a byte for so long, the camera is said to be silent
-MARK_NS = 50_000_000  # the stream's progress is noted once in so long
 WARN_AT = (0.5, 0.75)  # of the ring
 SLOW = "the disk is too slow: recording stopped before anything was lost"
 Event = Callable[[Mapping[str, Any]], None]
-OnFull = Literal["stop", "drop", "wait"]
-
-
-@dataclass(frozen=True, slots=True)
-class RecorderOptions:
-    """How to record.
-
-    Args:
-        ring_s: seconds of data between camera and disk.
-        memory: bytes the ring may have.
-        on_full: what to do when the ring is nearly full: "stop" keeping in good order before anything is lost; "drop"
-            what does not fit, counted; "wait" for the disk, for sources that can wait (replays, emulated time).
-        segment_bytes, sync_s, direct: as in SegmentWriter.
-    """
-
-    ring_s: float = 1.0
-    memory: int = 1 << 30
-    on_full: OnFull = "stop"
-    segment_bytes: int = 1 << 30
-    sync_s: float = 1.0
-    direct: bool = True
-
-
-@dataclass(frozen=True, slots=True)
-class RecorderState:
-    """Where a recorder stands; `trouble` ended the keeping, empty while all is well."""
-
-    keeping: bool
-    epoch: int
-    seen_bytes: int
-    kept_bytes: int
-    chunks: int
-    synced: int
-    fill: int
-    slots: int
-    high_water: int
-    lost_transport: int
-    lost_recorder: int
-    trouble: str
 
 
 class Recorder:
@@ -111,16 +74,19 @@ class Recorder:
         )
         self.ring = Ring(self.payload, slots)
         self._event = event
+        self._numbering = Numbering(first_epoch)
+        self._looks = Looks(
+            profile, self.ring, self.options.on_full == "wait", self._numbering, self._count_lost, self._tell
+        )  # fmt: skip
         writer = SegmentWriter(
             folder, host, lambda kind, words: self._tell(kind, words=words), segment_bytes=self.options.segment_bytes,
             sync_s=self.options.sync_s, direct=self.options.direct,
         )  # fmt: skip
         self._drain = Drain(
-            self.ring, writer, take, first, self.tick_bytes, acknowledged, self._give_up, self._fail
+            self.ring, writer, take, first, self.tick_bytes, acknowledged, self._give_up, self._fail,
+            self._looks.look if self.options.watch else None,
         )  # fmt: skip
-        self._base: int | None = None  # added to the source's epochs
-        self._first_epoch = first_epoch
-        self._progress: list[tuple[int, int, int]] = []  # of each stretch of time the most punctual transfer
+        self._progress = Progress(self.tick_bytes / 1e9 * profile.rate_hz)
         self._lock = threading.Lock()
         self._want = False  # what keep() and pause() ask for
         self._keeping = False
@@ -134,7 +100,7 @@ class Recorder:
         self._last_ns = host.now_ns()
         self._silent = False
         self._spans: list[list[int]] = []
-        self._peek: tuple[NDArray[np.uint8], list[int]] | None = None
+        self._glimpse: Glimpse | None = None
         self._ready = threading.Event()
         self._read = threading.Thread(target=self._reading, name="spike-reader", daemon=True)
 
@@ -170,16 +136,15 @@ class Recorder:
 
     def peek(self, ticks: int, timeout_ns: int = 2_000_000_000) -> NDArray[np.uint8] | None:
         """The next whole ticks of the stream, uint8[ticks, tick_bytes], kept or not; None where none come in time."""
-        wanted = np.zeros(ticks * self.tick_bytes, np.uint8)
-        state = [0, -1, 0]  # filled, epoch, byte expected next
+        wanted = Glimpse(ticks, self.tick_bytes)
         with self._lock:
-            self._peek = (wanted, state)
+            self._glimpse = wanted
         until = self.host.now_ns() + timeout_ns
-        while state[0] < len(wanted) and self.host.now_ns() < until and self._read.is_alive():
+        while not wanted.full and self.host.now_ns() < until and self._read.is_alive():
             self.host.sleep_until(self.host.now_ns() + 5_000_000)
         with self._lock:
-            self._peek = None
-        return wanted.reshape(ticks, self.tick_bytes) if state[0] == len(wanted) else None
+            self._glimpse = None
+        return wanted.ticks() if wanted.full else None
 
     def state(self) -> RecorderState:
         """Where it stands."""
@@ -205,9 +170,7 @@ class Recorder:
 
     def progress(self) -> list[tuple[int, int, int]]:
         """New since the last call: (epoch, bytes of it, host time after), the most punctual transfer of each 50 ms."""
-        with self._lock:
-            told, self._progress = self._progress[:-1], self._progress[-1:]
-        return told
+        return self._progress.told()
 
     def device_ns(self, byte: int) -> int:
         """The spike camera's own time at a byte of an epoch: nominal, whatever the rate truly is."""
@@ -247,6 +210,7 @@ class Recorder:
                 if not self._want:
                     self._end()
             self._end()
+            self._looks.flush()
 
     def _nothing(self) -> None:
         if not self._silent and self.host.now_ns() - self._last_ns > SILENT_NS:
@@ -254,44 +218,39 @@ class Recorder:
             self._tell("silent", words="no byte came from the spike camera for 2 s")
 
     def _take(self, block: Block) -> None:
-        if self._base is None:
-            self._base = self._first_epoch - block.epoch
-        if self._base:
-            block = replace(block, epoch=block.epoch + self._base)
+        block = self._numbering.take(block)
         self._last_ns, self._silent = block.after_ns, False
-        self._note(block)
+        self._progress.note(block)
         data, at = block.data, block.byte_index
         self._seen += len(data)
         if block.epoch != self._epoch or at != self._next:
             self._new_epoch(block)
         self._next = at + len(data)
-        if self._peek is not None:
-            self._show(block)
+        with self._lock:
+            if self._glimpse is not None:
+                self._glimpse.show(block)
         if self._want and not self._keeping and not self._trouble:
             skip = min(-at % self.tick_bytes, len(data))
-            self._pending.skipped += skip
+            self._pass_by(data[:skip], at)
             data, at = data[skip:], at + skip
             if len(data):
+                self._looks.flush()
                 self._keeping = True
                 self._spans.append([self._epoch, at, at])
         if self._keeping:
             self._keep(data, at, block)
         else:
-            self._pending.skipped += len(data)
+            self._pass_by(data, at)
 
-    def _note(self, block: Block) -> None:
-        end = block.byte_index + len(block.data)
-        with self._lock:
-            if self._progress:
-                epoch, byte, at = self._progress[-1]
-                if epoch == block.epoch and at // MARK_NS == block.after_ns // MARK_NS:
-                    if self.device_ns(end) - block.after_ns <= self.device_ns(byte) - at:
-                        return
-                    self._progress.pop()
-            self._progress.append((block.epoch, end, block.after_ns))
+    def _pass_by(self, data: NDArray[np.uint8], at: int) -> None:
+        """Bytes that are not kept."""
+        self._pending.skipped += len(data)
+        if self.options.watch:
+            self._looks.pass_by(data, self._epoch, at)
 
     def _new_epoch(self, block: Block) -> None:
         self._hand_over()
+        self._looks.flush()
         first, lost = self._epoch < 0, block.lost_bytes
         if block.epoch == self._epoch and block.byte_index > self._next:
             lost = max(lost, block.byte_index - self._next)  # the driver skipped bytes and did not say so
@@ -299,8 +258,8 @@ class Recorder:
         self._pending.skipped = self._pending.lost_recorder = 0
         self._pending.lost_transport += lost
         self._pending.suspect = block.suspect_bytes
-        self._lost_transport += lost
-        if lost or block.lost_why:
+        if block.lost_why != FRAMING and (lost or block.lost_why):  # that one was told when it was found
+            self._count_lost(lost)
             self._tell("transport", epoch=block.epoch, byte_index=block.byte_index, lost_bytes=lost,
                        suspect_bytes=block.suspect_bytes,
                        words=f"lost on the link: {block.lost_why or 'a gap'}")  # fmt: skip
@@ -331,13 +290,8 @@ class Recorder:
         slot = self.ring.take(wait=self.options.on_full == "wait")
         if slot is None:
             return None
-        told = self._pending
-        slot.epoch, slot.byte_index = self._epoch, at
-        slot.lost_transport, slot.lost_recorder = told.lost_transport, told.lost_recorder
-        slot.skipped, slot.suspect, slot.why = told.skipped, told.suspect, told.why
-        told.lost_transport = told.lost_recorder = told.skipped = told.suspect = 0
-        told.why = ""
-        self._slot = slot
+        slot.epoch, slot.byte_index, self._slot = self._epoch, at, slot
+        slot.tell(self._pending)
         return slot
 
     def _hand_over(self) -> None:
@@ -366,20 +320,13 @@ class Recorder:
             self._hand_over()
             self._keeping = False
 
-    def _show(self, block: Block) -> None:
+    def _count_lost(self, lost: int) -> None:
         with self._lock:
-            if self._peek is None:
-                return
-            wanted, state = self._peek
-            data, at = block.data, block.byte_index
-            if (state[1], state[2]) != (block.epoch, at):  # begin anew at a whole tick
-                skip = min(-at % self.tick_bytes, len(data))
-                state[0], data = 0, data[skip:]
-            n = min(len(data), len(wanted) - state[0])
-            wanted[state[0] : state[0] + n] = data[:n]
-            state[:] = state[0] + n, block.epoch, block.byte_index + len(block.data)
+            self._lost_transport += lost
 
     def _give_up(self, slot: Slot) -> None:
+        if not slot.wanted:
+            return
         self._lost_recorder += slot.used
         self._tell("recorder", epoch=slot.epoch, byte_index=slot.byte_index, lost_bytes=slot.used,
                    words="LOST: these bytes could not be written")  # fmt: skip

@@ -19,7 +19,10 @@ STOP_AT = 0.95  # of the ring: recording ends in good order here, before anythin
 
 @dataclass(slots=True)
 class Slot:
-    """One buffer: a page for the header, then room for a payload; `used` bytes of it are filled."""
+    """One buffer: a page for the header, then room for a payload; `used` bytes of it are filled.
+
+    What is not `wanted` is only looked at, and not written.
+    """
 
     page: memoryview
     room: NDArray[np.uint8]
@@ -32,6 +35,14 @@ class Slot:
     skipped: int = 0
     suspect: int = 0
     why: str = ""
+    wanted: bool = True
+
+    def tell(self, pending: Slot) -> None:
+        """Take over what was lost before this buffer; nothing is pending any more."""
+        self.lost_transport, self.lost_recorder = pending.lost_transport, pending.lost_recorder
+        self.skipped, self.suspect, self.why = pending.skipped, pending.suspect, pending.why
+        pending.lost_transport = pending.lost_recorder = pending.skipped = pending.suspect = 0
+        pending.why = ""
 
 
 class Ring:
@@ -84,7 +95,7 @@ class Ring:
                 return None
             slot = self._free.popleft()
         slot.used = slot.lost_transport = slot.lost_recorder = slot.skipped = slot.suspect = 0
-        slot.why = ""
+        slot.why, slot.wanted = "", True
         slot.stamps.clear()
         return slot
 

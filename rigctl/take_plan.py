@@ -13,9 +13,10 @@ from typing import Any
 from spikerig.dataset.errors import RigError, UsageError
 from spikerig.dataset.segments import PAGE
 from spikerig.dataset.wire import WireProfile
+from spikerig.rigctl.led_view import LedPlan
 from spikerig.rigctl.panel_view import PanelPlan
 from spikerig.rigctl.profiles import DEFAULT, profile_named, profile_of
-from spikerig.rigctl.recorder import OnFull, RecorderOptions
+from spikerig.rigctl.recorder_options import OnFull, RecorderOptions
 from spikerig.rigctl.sim.limits import Faults, limits, read_record
 
 NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,62}")
@@ -65,15 +66,16 @@ class Sync:
     """`[sync]`: how the clocks are brought together.
 
     Args:
-        mode: "box": a Harp clock box with the LED panel in both views; "optical": any blinking LED in both views;
-            "none": host stamps alone, a bound of milliseconds.
+        mode: "box": a Harp clock box with the LED panel in both views; "optical": any plain blinking LED in both views
+            (`[led]`), for the time between the two cameras alone; "none": nothing: frames and spikes are not paired.
         port: of the box; empty: the only one there is.
-        probe_s: seconds between two questions to the box.
+        probe_s: seconds between two questions to the box; 16 a second are what a minute of hold-over within 100 us
+            needs (docs/clock.md).
     """
 
     mode: str = limits("box", choices=("box", "optical", "none"))
     port: str = limits("")
-    probe_s: float = limits(0.5, 0.01, 60, "s")
+    probe_s: float = limits(0.06, 0.01, 60, "s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,13 +109,14 @@ class Keeping:
     segment_mb: float = limits(1074.0, 1, 1_000_000, "MB")
     sync_s: float = limits(1.0, 0, 60, "s")
     direct: bool = limits(True)
+    watch: bool = limits(True)
 
     def options(self) -> RecorderOptions:
         """What the recorder takes."""
         full: OnFull = "stop" if self.on_full == "stop" else "drop" if self.on_full == "drop" else "wait"
         return RecorderOptions(
             self.ring_s, round(self.memory_mb * 1e6), full, round(self.segment_mb * 1e6) // PAGE * PAGE, self.sync_s,
-            self.direct,
+            self.direct, self.watch,
         )  # fmt: skip
 
 
@@ -132,6 +135,7 @@ class _Top:
     checks: Any = limits({})
     recorder: Any = limits({})
     panel: Any = limits(None)
+    led: Any = limits(None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,6 +168,7 @@ class TakePlan:
     checks: Checks
     recorder: Keeping
     panel: PanelPlan | None = None
+    led: LedPlan | None = None
 
     def as_json(self) -> dict[str, Any]:
         """The plan, whole, JSON-ready."""
@@ -214,8 +219,13 @@ def read_plan(table: Mapping[str, Any], source: str = "the plan") -> TakePlan:
         _profile(spike, source, faults), spike, rgb, read_record(Sync, top.sync, "sync", faults), checks,
         read_record(Keeping, top.recorder, "recorder", faults),
         None if top.panel is None else read_record(PanelPlan, top.panel, "panel", faults),
+        None if top.led is None else read_record(LedPlan, top.led, "led", faults),
     )  # fmt: skip
-    panel = plan[-1]
+    panel, led = plan[-2:]
+    if isinstance(led, LedPlan):
+        for arm in ("spike", "rgb"):
+            if len(getattr(led, arm)) % 2:
+                faults.add(f"led.{arm}", f"is {list(getattr(led, arm))}, expected x and y of each LED")
     if isinstance(panel, PanelPlan) and panel.bits is not None and panel.slow >= panel.bits:
         faults.add("panel.slow", f"is {panel.slow}, expected below panel.bits, {panel.bits}")
     faults.raise_any()

@@ -4,11 +4,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from spikerig.dataset.rawtake import open_take
+from spikerig.rigctl.ingest_led import led_sights
+from spikerig.rigctl.ingest_slips import mended
+from spikerig.rigctl.ingest_times import Framing, Times, read_truth
+from spikerig.rigctl.led_view import led_plan
 from spikerig.rigctl.operator import Nobody
-from spikerig.rigctl.record import Rig, Tally, record
+from spikerig.rigctl.record import record
 from spikerig.rigctl.sim.emulate.rig import RigSpec, open_emulated
 from spikerig.rigctl.sim.limits import Faults, read_record
 from spikerig.rigctl.take_plan import TakePlan, read_plan
+from spikerig.rigctl.tally import Rig, Tally
 
 WIRE = {"name": "tiny", "width": 64, "height": 48, "row_bits": 64, "rate_hz": 20_000, "link_bytes_s": 3.6e8,
         "packet_bytes": 16384}  # fmt: skip
@@ -33,7 +39,7 @@ def rig_of(plan: TakePlan, folder: Path, after_ns: int = 0, **more: Any) -> Rig:
     """The emulated rig, with more in its tables."""
     table: dict[str, Any] = {k: dict(v) if isinstance(v, dict) else v for k, v in CRYSTALS.items()}
     for key, value in more.items():
-        table[key] = {**table[key], **value} if isinstance(value, Mapping) else value
+        table[key] = {**table.get(key, {}), **value} if isinstance(value, Mapping) else value
     faults = Faults("spec")
     spec = read_record(RigSpec, table, "", faults)
     faults.raise_any()
@@ -65,3 +71,15 @@ def take(folder: Path, plan: TakePlan | None = None, operator: Any = None, resum
             return record(plan, rig, folder, operator or Nobody(), resume=resume)
     finally:
         rig.close()
+
+
+def led_clocks(folder: Path) -> tuple[Times, Any, Any]:
+    """The clocks of a take by its LED, what was read of it, and what really happened."""
+    raw = open_take(folder)
+    times = Times(raw, read_truth(raw))
+    wire, views = mended(raw, raw.views())
+    led = led_plan(raw.plan)
+    assert led is not None
+    found = led_sights(raw, views, led, times.marks, wire, Framing(wire, [s for v in views for s in v.spikes]))
+    times.fit(found.sights)
+    return times, found, read_truth(raw)

@@ -66,9 +66,9 @@ ROWS: list[tuple[str, str, str, str]] = [
      f"{_L}::test_a_lens_that_folds_is_not_followed_beyond_its_fold"),
     ("all of `bad_records`: not JSON, NaN, 5000 digits, nested deeply, matrices that are none", "read_calibration",
      "one DataError", "calib/test_rig.py::test_hostile_records_end_in_one_error"),
-    ("boards that do not tilt at all", "solve, fit_rig", "a huge variance, no exception; refused",
+    ("boards that do not tilt at all", "solve, fit_arms", "a huge variance, no exception; refused",
      "calib/test_optics.py::test_boards_that_barely_tilt_are_refused_however_small_the_residual"),
-    ("an arm mirrored, labels turned at random", "fit_rig", "the rig, to a tenth of a pixel",
+    ("an arm mirrored, labels turned at random", "fit_arms", "the rig, to a tenth of a pixel",
      "calib/test_optics.py::test_a_rig_is_found_whatever_its_mirror_and_labels"),
     ("pairs shot at different instants, or shifted by one", "measure", "refused, in both parities",
      "calib/test_optics.py::test_pairs_shot_at_different_instants_are_refused_in_both_parities"),
@@ -110,5 +110,5 @@ ROWS: list[tuple[str, str, str, str]] = [
      "calib/test_regions.py::test_rectangles_and_files"),
     ("maps of another sensor, of a file that is none", "data texture --flat", "exit 2 or 4, nothing written",
      "dataset/test_data_cli.py::test_a_texture_is_evened_out_on_request"),
-    ("no view in common", "fit_rig", "NumericsError", "calib/test_optics.py::test_no_view_in_common_is_said"),
+    ("no view in common", "fit_arms", "NumericsError", "calib/test_optics.py::test_no_view_in_common_is_said"),
 ]  # fmt: skip

@@ -151,4 +151,12 @@ ROWS = [
     ("answers before questions, no marks, NaN", "gate, track, hull_floor", "refused by name",
      T + "test_nonsense_is_refused"),
     ("6 hours of marks, one every 10 s", "track", "p99 below 25 us", T + "test_six_hours"),
+    ("an LED that repeats within what the stamps leave open", "frame_sights", "refused, with both numbers",
+     "calib/test_led.py::test_a_clip_that_may_have_seen_two_beats_is_refused"),
+    ("a light without a beat", "frame_sights", "told by its pattern, median within 40 us",
+     "calib/test_led.py::test_a_light_without_a_beat_is_told_by_its_pattern"),
+    ("an LED on in the last two frames of a clip only", "read_frames", "no edge off by more than 200 us",
+     "calib/test_panel_read.py::test_an_led_that_comes_on_as_the_clip_ends_makes_no_false_time"),
+    ("no clock box: a plain LED, its period 2.5 % off, its place unknown", "led_sights", "frames to spikes 100 us p99",
+     "rigctl/test_ingest_led.py::test_an_led_ties_every_frame_to_the_spikes"),
 ]  # fmt: skip

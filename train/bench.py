@@ -55,7 +55,8 @@ def rows(quick: bool = False) -> list[dict[str, Any]]:
     Returns:
         Dicts with kernel, seconds (CPU of forward and backward with the autograd around it, median), oracle_seconds
         (the same through the tiled pure-torch oracle in float32, one run), ratio, size, isa, threads; `raster` also
-        has consulted_per_pixel and splat_pixels_per_second (consulted, per second of one core).
+        has absgrad_seconds (with `absgrad`, the median ratio of calls in turns), consulted_per_pixel and
+        splat_pixels_per_second (consulted, per second of one core).
     """
     with one_thread():
         return [_raster(5 if quick else 15, 2_000 if quick else SPLATS), _ssim(5 if quick else 15)]
@@ -91,9 +92,14 @@ def _raster(repeats: int, n: int) -> dict[str, Any]:
     def oracle() -> None:
         torch.autograd.grad(oracles.render(splats, K, WIDTH, HEIGHT, pose, tiled=True)[0], leaves, grad)
 
+    def absolute() -> None:
+        torch.autograd.grad(render(splats, K, WIDTH, HEIGHT, pose, absgrad=True).image, leaves, grad)
+
     row = _row("raster", f"{n} splats, {WIDTH}x{HEIGHT}, forward+backward", mine, oracle, repeats)
     pairs = consulted(render(splats, K, WIDTH, HEIGHT, pose))
+    turns = [(_seconds(mine, 1), _seconds(absolute, 1)) for _ in range(repeats)]
     return row | {
+        "absgrad_seconds": row["seconds"] * median(b / a for a, b in turns),
         "consulted_per_pixel": pairs / (WIDTH * HEIGHT),
         "splat_pixels_per_second": pairs / row["seconds"],
     }

@@ -19,8 +19,9 @@ def fit(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the run.")],
     method: Annotated[
         str,
-        typer.Option(help="Loss and camera model: plain, average, bad, spikenerf, spikenerf-5x, spike-ratio, "
-                     "spike-hybrid, oracle."),
+        typer.Option(help="Loss and camera model: plain, average, spikenerf, spikenerf-5x, spike-ratio, "
+                     "spike-hybrid, ours, colour-spikes, oracle; baselines bad, edi, e2-2x, e2-5x, deblur, "
+                     "mpr, d2net."),
     ] = "plain",
     field: Annotated[str, typer.Option(help="The model: splat, nerf (the paper's), nerf-fast (hash grid).")] = "splat",
     preset: Annotated[str, typer.Option(help="Effort: draft, standard, full; paper (field nerf).")] = "standard",
@@ -33,13 +34,20 @@ def fit(
         str | None,
         typer.Option(help="What w multiplies: mean, sum-batch, sum-image, u8 (the paper does not say)."),
     ] = None,
-    gray: Annotated[str | None, typer.Option(help="RGB to gray: calibrated, rec601, learned (the paper's).")] = None,
+    gray: Annotated[
+        str | None, typer.Option(help="RGB to gray: calibrated, rec601, learned (the paper's), constrained, response.")
+    ] = None,
     pose_label: Annotated[
         str | None, typer.Option(help="Pose a blurry view is labelled with: mid or first (of its exposure).")
     ] = None,
     poses_per_view: Annotated[int | None, typer.Option(help="Sub-poses averaged per view.")] = None,
     textures_per_view: Annotated[int | None, typer.Option(help="Instants with textures per view.")] = None,
     background: Annotated[str | None, typer.Option(help="black, white or random.")] = None,
+    restorer: Annotated[
+        Path | None, typer.Option(help="Deblurring network of mpr and d2net: TorchScript, or torch.export's .pt2.")
+    ] = None,
+    trust: Annotated[bool, typer.Option("--trust", help="Let the restorer run; it is a program, and runs as you.")]
+    = False,
     device: Annotated[str, typer.Option(help="cpu, or cuda through gsplat (extra 'cuda').")] = "cpu",
     setting: Annotated[
         list[str] | None, typer.Option("--set", help="Any other setting as name=value; repeat as needed.")
@@ -74,6 +82,7 @@ def fit(
         "steps": steps, "seconds": seconds, "splats": splats, "tfs_weight": tfs_weight, "gray": gray,
         "weight_reading": weight_reading, "pose_label": pose_label, "poses_per_view": poses_per_view,
         "textures_per_view": textures_per_view, "background": background,
+        "restorer": None if restorer is None else str(restorer), "trust": trust or None,
     }  # fmt: skip
     if steps is not None and seconds is not None:
         raise UsageError("a run ends by --steps or by --seconds, not both", value=f"{steps} steps, {seconds} s")

@@ -1,4 +1,4 @@
-"""Putting splats where they are needed: MCMC (Kheradmand et al. 2024), relocation, growth and noise.
+"""Putting splats where they are needed: MCMC (Kheradmand et al. 2024), relocation, growth and noise (Kerbl's: grow.py).
 
 Off by default for short runs, where it hardly matters. All draws come from (seed, step), so a resumed run repeats them.
 """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -57,12 +57,22 @@ class Model(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """What a field may need to know of a step: fraction of the run done, background, the step's random draws."""
+    """What a field may need to know of a step: fraction of the run done, background, the step's random draws.
+
+    Every draw appends what it cost to `drawn`: 1 a picture, or the number of rays.
+    `notes`: what was seen on the way, by name: loss terms ("colour", "tfs", "parts") and what the field itself keeps.
+    """
 
     number: int
     fraction: float
     background: tuple[float, float, float]
     rng: np.random.Generator
+    drawn: list[int] = field(default_factory=list)
+    notes: dict[str, list[Any]] = field(default_factory=dict)
+
+    def note(self, name: str, what: Any) -> None:
+        """Add to the notes."""
+        self.notes.setdefault(name, []).append(what)
 
 
 class Field(Protocol):
@@ -91,6 +101,10 @@ class Field(Protocol):
 
     def regularise(self, params: Tensors, config: FitConfig) -> list[Tensor]:
         """Terms that are added to the loss."""
+        ...
+
+    def sense(self, config: FitConfig, step: Step) -> None:
+        """Before the gradients of a step are taken: look at its terms apart."""
         ...
 
     def tend(self, state: Any, config: FitConfig, step: Step) -> None:

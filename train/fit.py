@@ -24,12 +24,14 @@ from spikerig.dataset.scene import Camera
 from spikerig.train import checkpoint
 from spikerig.train.adam import update
 from spikerig.train.config import FitConfig, effective_weight
+from spikerig.train.converter import LEARNED, converter, start_converter
 from spikerig.train.field import Field, Model, Step, Tensors
 from spikerig.train.fields import field_of
+from spikerig.train.filters import tfs_through
 from spikerig.train.gauge import Gauge
 from spikerig.train.losses import average_exposure, l2_loss, light_of, mean_weights, tfs_loss
 from spikerig.train.model import BACKGROUNDS
-from spikerig.train.parts import exposed_by, own, part_of, parts_of, pose_of, start_parts
+from spikerig.train.parts import drawn_by, exposed_by, own, part_of, parts_of, start_parts
 from spikerig.train.ssim import l1_ssim
 from spikerig.train.targets import Targets, TrainView
 
@@ -44,6 +46,7 @@ class State:
     """What a fit changes: parameters and Adam's moments by name, the next step, seconds trained, held-out dB over time.
 
     `grids`: what the field keeps beside its parameters.
+    `cpu`: seconds of CPU, all threads; `renders`: pictures of splats, or rays, drawn for training so far.
     `memory`: linear light (float16[H,W,3]) of the last renders of sub-poses by (view, phase), where fresh_poses asks.
     """
 
@@ -54,6 +57,8 @@ class State:
     history: list[dict[str, Any]] = field(default_factory=list)
     memory: dict[tuple[str, float], Tensor] = field(default_factory=dict)
     grids: Tensors = field(default_factory=dict)
+    cpu: float = 0.0
+    renders: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,8 +90,8 @@ class Task:
 def new_state(points: Points | None, task: Task) -> State:
     """Step 0: the field's start, and the gray converter where it is learned."""
     params, grids = task.field.start(points, task.gauge, task.config)
-    if task.config.gray == "learned" and task.targets.gray is not None:
-        params = {**params, "gray": task.gray}
+    if task.config.gray in LEARNED and task.targets.gray is not None:
+        params = {**params, "gray": start_converter(task.config.gray, task.gray)}
     params = {**params, **start_parts(task)}
     leaves = {name: p.detach().clone().requires_grad_() for name, p in params.items()}
     moments = {name: (torch.zeros_like(p), torch.zeros_like(p)) for name, p in params.items()}
@@ -125,9 +130,10 @@ def train(
     """
     with torch_threads(task.field.torch_threads()):
         while (fraction := fraction_done(state, task.config)) < 1:
-            begin = time.perf_counter()
+            begin, worked = time.perf_counter(), time.process_time()
             loss = one_step(state, task, fraction)
             state.seconds += time.perf_counter() - begin
+            state.cpu += time.process_time() - worked
             after(state, fraction_done(state, task.config), loss)
     return state
 
@@ -137,29 +143,36 @@ def fraction_done(state: State, config: FitConfig) -> float:
     return state.seconds / config.seconds if config.seconds > 0 else state.step / config.steps
 
 
-def one_step(state: State, task: Task, fraction: float) -> float:
-    """One look, one update; returns the loss. Random draws: view order by epoch, the rest by step."""
-    config, field = task.config, task.field
+def step_of(state: State, task: Task, fraction: float) -> tuple[TrainView, Step]:
+    """What the next step looks at, and its draws: view order by epoch, the rest by step."""
+    config = task.config
     rng = np.random.default_rng((config.seed, 2, state.step))
-    view = field.look(task.targets, task.camera, config, state.step, rng)
-    for p in state.params.values():
-        p.grad = None
+    view = task.field.look(task.targets, task.camera, config, state.step, rng)
     background = BACKGROUNDS[config.background]
     if config.background == "random":
         r, g, b = rng.uniform(0, 1, 3)
         background = (r, g, b)
-    step = Step(state.step, fraction, background, rng)
+    return view, Step(state.step, fraction, background, rng)
+
+
+def one_step(state: State, task: Task, fraction: float) -> float:
+    """One look, one update; returns the loss."""
+    for p in state.params.values():
+        p.grad = None
+    view, step = step_of(state, task, fraction)
     loss = view_loss(state, task, view, step)
     value = loss.item()
     if not np.isfinite(value):
         raise _not_finite(state, f"the loss of view '{view.name}' is {value}")
     if loss.requires_grad:
+        task.field.sense(task.config, step)
         loss.backward()
     _descend(state, task, fraction)
     if state.step % CHECK_EVERY == 0:
         check_finite(state)
-    field.tend(state, config, step)
+    task.field.tend(state, task.config, step)
     state.step += 1
+    state.renders += sum(step.drawn)
     return value
 
 
@@ -169,7 +182,7 @@ def view_loss(state: State, task: Task, view: TrainView, step: Step) -> Tensor:
     model = task.model(state)
 
     def draw(phase: float) -> list[Tensor]:
-        images = task.field.draw(model, view, pose_of(state.params, view, phase, config), step)
+        images = drawn_by(state.params, view, phase, step, task, lambda v, pose: task.field.draw(model, v, pose, step))
         if config.fresh_poses > 0:
             state.memory[view.name, phase] = light_of(images[0]).half()
         return images
@@ -200,16 +213,28 @@ def _pictures_loss(
     elif drawn:
         kept = [state.memory[view.name, p] for p in targets.colour if p not in pictures]
         others = sum((light.float() for light in kept[1:]), kept[0].float()) if kept else None
-        exposed = exposed_by(state.params, view, average_exposure(drawn, others, len(targets.colour)), config)
+        exposed = exposed_by(state.params, view, _average(drawn, others, task), config)
         loss = len(targets.colour) / len(drawn) * colour_loss(exposed, view.frame, view.valid, config)
     else:  # only an instant with textures and no part in the average
         loss = torch.zeros(())
-    if task.weight > 0:
-        loss = loss + task.weight * _tfs_term(state, task, view, pictures)
+    if config.colour_weight != 1:
+        loss = config.colour_weight * loss
+    step.note("colour", loss)
+    if task.weight > 0 and step.fraction >= config.tfs_from:
+        step.note("tfs", task.weight * _tfs_term(state, task, view, pictures))
+        loss = loss + step.notes["tfs"][-1]
     for part in parts_of(config):
         if part.loss is not None:
-            loss = sum(part.loss(state, task, view, pictures, step), loss)
+            step.note("parts", sum(part.loss(state, task, view, pictures, step), torch.zeros(())))
+            loss = loss + step.notes["parts"][-1]
     return loss
+
+
+def _average(drawn: list[Tensor], others: Tensor | None, task: Task) -> Tensor:
+    """The exposed picture of sub-poses, in the config's domain."""
+    if task.config.average_domain == "encoded":
+        return torch.stack(drawn).mean(0)
+    return average_exposure(drawn, others, len(task.targets.colour))
 
 
 def _fresh(state: State, task: Task, view: TrainView, rng: np.random.Generator) -> list[float]:
@@ -223,12 +248,18 @@ def _fresh(state: State, task: Task, view: TrainView, rng: np.random.Generator) 
 
 
 def _tfs_term(state: State, task: Task, view: TrainView, pictures: dict[float, Tensor]) -> Tensor:
-    gray = state.params.get("gray", task.gray)
+    gray, heights = task.gray, None
+    if "gray" in state.params:
+        gray, heights = converter(task.config.gray, state.params["gray"], task.gray)
     supervised = [phase for phase in pictures if view.instants[phase].textures]
     total = torch.zeros(())
     for phase in supervised:
         for texture, weight in view.instants[phase].textures:
-            total = total + tfs_loss(pictures[phase], texture, weight, gray, task.config.tfs_domain)
+            if task.targets.filters is not None:
+                seen = (view.beside["site"], task.targets.filters.weights)
+                total = total + tfs_through(pictures[phase], texture, weight, *seen, task.config.tfs_domain)
+                continue
+            total = total + tfs_loss(pictures[phase], texture, weight, gray, task.config.tfs_domain, heights)
     return total / len(supervised) if len(supervised) > 1 else total
 
 
@@ -290,6 +321,7 @@ def save_state(path: Path, state: State, config: FitConfig) -> None:
     tensors |= {f"grid/{n}": g for n, g in state.grids.items()}
     tensors |= {f"memory/{view}/{phase!r}": image for (view, phase), image in state.memory.items()}
     record = {"step": state.step, "seconds": state.seconds, "history": state.history, "config": config.as_json()}
+    record |= {"cpu": state.cpu, "renders": state.renders}
     checkpoint.save(path, tensors, record)
 
 
@@ -299,6 +331,7 @@ def load_state(path: Path) -> tuple[State, dict[str, Any]]:
     leaves = {n.removeprefix("param/"): p.requires_grad_() for n, p in tensors.items() if n.startswith("param/")}
     moments = {name: (tensors[f"adam/{name}/mean"], tensors[f"adam/{name}/square"]) for name in leaves}
     state = State(leaves, moments, int(record["step"]), float(record["seconds"]), list(record["history"]))
+    state.cpu, state.renders = float(record.get("cpu", 0.0)), int(record.get("renders", 0))
     state.grids = {n.removeprefix("grid/"): g for n, g in tensors.items() if n.startswith("grid/")}
     for name, image in tensors.items():
         if name.startswith("memory/"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,19 +10,31 @@ import torch
 from torch import Tensor
 
 from spikerig.train.config import FitConfig
+from spikerig.train.contraction import contract, distance_of
 from spikerig.train.hashgrid import FEATURES, Layout, hash_encode, layout_of
 from spikerig.train.layers import chain, harmonics, new_layer
-from spikerig.train.rays import BOX, Rays, bounds
-from spikerig.train.volume import Traced, composite, inverse_cdf, stratified, weights_of
+from spikerig.train.rays import BOX, NEAREST, Rays, bounds
+from spikerig.train.volume import Traced, composite, locate, stratified, weights_of
 
 if TYPE_CHECKING:
     from spikerig.train.field import Step, Tensors
 
 GEOMETRY = 15  # numbers handed from the density's network to the colour's
 DENSEST = 11.0  # of the logarithm of density; e^11 is opaque within a thousandth of the gauge's unit
-EMPTY = 0.5  # density below which a cell is skipped: the whole box of it lets a third of the light through
-REFRESH, REVISIT, FADE = 16, 8, 0.8  # steps between refreshes, 1 / share of cells looked at, what stays of a cell's
+EMPTY = 0.05  # density below which a cell is skipped: the whole box of it lets a third of the light through
+THICK = 5.0
+LATER_SPREAD = 0.1
+REFRESH, REVISIT, FADE = 16, 8, 0.6  # steps between refreshes, 1 / share of cells looked at, what stays of a cell's
 SPREAD = 0.25  # of the samples, evenly over what is not empty; the others where the grid's light goes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pieces:
+    """Rays cut up: a sample's distance [B,N], the cuts [B,N+1], and how much of each piece is not empty [B,N]."""
+
+    distance: Tensor
+    edges: Tensor
+    length: Tensor
 
 
 def grid_layout(config: FitConfig) -> Layout:
@@ -58,10 +71,26 @@ class _Exp(torch.autograd.Function):
 
 
 def density_of(params: Tensors, config: FitConfig, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Density [N] and geometry [N,15] at points [N,3] of the gauge."""
-    features = hash_encode(points * (0.5 / BOX) + 0.5, params["table"], grid_layout(config))
+    """Density [N] and geometry [N,15] at points [N,3] of the gauge; with `contract`, density a contracted length."""
+    return density_in(params, config, unit(points, config))
+
+
+def unit(points: Tensor, config: FitConfig) -> Tensor:
+    """Points [...,3] of the gauge in the cube [0, 1]^3 that the grids fill; without `contract` some lie beyond."""
+    return contract(points) * 0.25 + 0.5 if config.contract else points * (0.5 / BOX) + 0.5
+
+
+def density_in(params: Tensors, config: FitConfig, places: Tensor) -> tuple[Tensor, Tensor]:
+    """Density [N] and geometry [N,15] at places [N,3] of the unit cube."""
+    features = hash_encode(places, params["table"], grid_layout(config))
     found = chain(params, ("density/1", "density/2"), features)
     return _Exp.apply(found[:, 0]), found[:, 1:]  # type: ignore[return-value]
+
+
+def colour_of(params: Tensors, config: FitConfig, geometry: Tensor, directions: Tensor) -> Tensor:
+    """Colour [N,3] (sRGB codes) from geometry [N,15] and unit directions [N,3]."""
+    seen = harmonics(directions, config.sh_degree)
+    return torch.sigmoid(chain(params, ("colour/1", "colour/2"), torch.cat([geometry, seen], -1)))
 
 
 def trace_hashed(
@@ -72,11 +101,11 @@ def trace_hashed(
     background: Tensor,
     rng: np.random.Generator | None,
 ) -> list[Traced]:
-    """What rays see: `coarse` cells of the occupancy grid are looked up, `fine` samples placed, the network asked.
+    """What rays see: cells of the occupancy grid are looked up, then densities, then the networks are asked.
 
     Args:
         params, grids: of the field.
-        config: coarse, fine: numbers of samples.
+        config: coarse, probes, fine: how many cells, densities without a gradient (0: none), samples of a ray.
         rays: B of the gauge.
         background: [3].
         rng: where in their pieces samples lie; None: in the middle.
@@ -84,47 +113,68 @@ def trace_hashed(
     Edges: a ray that meets only empty cells sees the background and has no gradient; empty gaps have no length.
     """
     with torch.no_grad():
-        distance, length = place(grids["occupancy"], config, rays, rng)
-        points = rays.origins[:, None] + rays.directions[:, None] * distance[..., None]
+        pieces = place(grids["occupancy"], config, rays, rng, config.probes or config.fine)
+        if config.probes:
+            density, _ = density_of(params, config, _points(rays, along(pieces.distance, config)).reshape(-1, 3))
+            weights, _ = weights_of(density.reshape(pieces.distance.shape), pieces.length)
+            pieces = sample(pieces, weights, LATER_SPREAD, config.fine, rng)
+        distance, length = along(pieces.distance, config), pieces.length
+    points = _points(rays, distance)  # with the gradient of rays that have one: of poses and kernels that are learned
     density, geometry = density_of(params, config, points.reshape(-1, 3))
-    seen = harmonics(rays.directions, config.sh_degree)[:, None].expand(-1, config.fine, -1).flatten(0, 1)
-    colour = torch.sigmoid(chain(params, ("colour/1", "colour/2"), torch.cat([geometry, seen], -1)))
+    ways = rays.directions[:, None].expand(-1, config.fine, -1).flatten(0, 1)
+    colour = colour_of(params, config, geometry, ways)
     shape = distance.shape
     return [composite(density.reshape(shape), length, distance, colour.reshape(*shape, 3), background)]
 
 
-def place(occupancy: Tensor, config: FitConfig, rays: Rays, rng: np.random.Generator | None) -> tuple[Tensor, Tensor]:
-    """Distances [B,fine] of samples and the length of ray each stands for, empty stretches left out."""
-    near, far = bounds(rays)
+def _points(rays: Rays, distance: Tensor) -> Tensor:
+    return rays.origins[:, None] + rays.directions[:, None] * distance[..., None]
+
+
+def place(occupancy: Tensor, config: FitConfig, rays: Rays, rng: np.random.Generator | None, count: int) -> Pieces:
+    """`count` samples a ray where the occupancy grid has something, empty stretches left out."""
+    near, far = _ends(rays, config)
     shift = None if rng is None else torch.from_numpy(rng.random((len(rays), 1), np.float32)).to(near)
     looked, edges = stratified(near, far, config.coarse, shift)
-    cells = cells_of(rays.origins[:, None] + rays.directions[:, None] * looked[..., None], len(occupancy))
+    cells = cells_of(unit(_points(rays, along(looked, config)), config), len(occupancy))
     density = occupancy.reshape(-1)[cells]
     length = torch.where(density > EMPTY, edges[:, 1:] - edges[:, :-1], 0.0)
-    weights, _ = weights_of(density, length)
-    share = (1 - SPREAD) * weights / weights.sum(-1, keepdim=True).clamp(min=1e-9)
-    share = share + SPREAD * length / length.sum(-1, keepdim=True).clamp(min=1e-9)
-    cuts = torch.arange(config.fine + 1, dtype=near.dtype, device=near.device) / config.fine
-    inside = 0.5 if rng is None else torch.from_numpy(rng.random((len(rays), config.fine), np.float32)).to(near)
-    middle = (torch.arange(config.fine, dtype=near.dtype, device=near.device) + inside) / config.fine
-    both = inverse_cdf(edges, share, torch.cat([cuts.expand(len(rays), -1), middle.expand(len(rays), -1)], -1))
-    found, distance = both[:, : config.fine + 1], both[:, config.fine + 1 :]
-    return distance, torch.diff(_occupied_before(found, edges, length)).clamp(min=0)
+    weights, _ = weights_of(density.clamp(max=THICK), length)
+    return sample(Pieces(looked, edges, length), weights, SPREAD, count, rng)
 
 
-def _occupied_before(distance: Tensor, edges: Tensor, length: Tensor) -> Tensor:
-    """How much of a ray before each distance [B,S] is not empty; edges [B,N+1] equally spaced, length [B,N]."""
-    count = length.shape[-1]
-    near, step = edges[:, :1], (edges[:, -1:] - edges[:, :1]) / count
-    at = ((distance - near) / step.clamp(min=1e-12)).clamp(0, count)
-    piece = at.long().clamp(max=count - 1)
-    before = torch.cumsum(length, -1) - length
-    return before.gather(-1, piece) + (at - piece) * length.gather(-1, piece)
+def sample(pieces: Pieces, weights: Tensor, spread: float, count: int, rng: np.random.Generator | None) -> Pieces:
+    """Cut rays anew into `count` pieces of equal weight, a share of it spread evenly over what is not empty."""
+    length = pieces.length
+    share = (1 - spread) * weights / weights.sum(-1, keepdim=True).clamp(min=1e-9)
+    share = share + spread * length / length.sum(-1, keepdim=True).clamp(min=1e-9)
+    rays, like = len(weights), weights
+    cuts = torch.arange(count + 1, dtype=like.dtype, device=like.device) / count
+    inside = 0.5 if rng is None else torch.from_numpy(rng.random((rays, count), np.float32)).to(like)
+    middle = (torch.arange(count, dtype=like.dtype, device=like.device) + inside) / count
+    piece, part = locate(share, torch.cat([cuts.expand(rays, -1), middle.expand(rays, -1)], -1))
+    low, high = pieces.edges.gather(-1, piece), pieces.edges.gather(-1, piece + 1)
+    found = low + (high - low) * part
+    cut, partly = piece[:, : count + 1], part[:, : count + 1]
+    before = (torch.cumsum(length, -1) - length).gather(-1, cut) + partly * length.gather(-1, cut)
+    return Pieces(found[:, count + 1 :], found[:, : count + 1], torch.diff(before).clamp(min=0))
 
 
-def cells_of(points: Tensor, side: int) -> Tensor:
-    """Numbers of the occupancy cells of points [...,3] of the gauge; beyond the box, those at its border."""
-    at = ((points * (0.5 / BOX) + 0.5) * side).long().clamp(0, side - 1)
+def _ends(rays: Rays, config: FitConfig) -> tuple[Tensor, Tensor]:
+    if not config.contract:
+        return bounds(rays)
+    near = torch.full_like(rays.forward, NEAREST)
+    return near, torch.full_like(near, 2.0)
+
+
+def along(distance: Tensor, config: FitConfig) -> Tensor:
+    """Distances along rays of where pieces are cut: themselves, or with `contract` those of contracted distances."""
+    return distance_of(distance) if config.contract else distance
+
+
+def cells_of(places: Tensor, side: int) -> Tensor:
+    """Numbers of the occupancy cells of places [...,3] of the unit cube; beyond it, those at its border."""
+    at = (places * side).long().clamp(0, side - 1)
     return (at[..., 2] * side + at[..., 1]) * side + at[..., 0]
 
 
@@ -138,7 +188,7 @@ def refresh(params: Tensors, grids: Tensors, config: FitConfig, step: Step) -> N
     # every REVISIT-th cell, another comb each time: all are visited in turn, at no cost of drawing
     cells = np.arange((step.number // REFRESH * 5) % REVISIT, total, REVISIT)
     corner = np.stack([cells % side, cells // side % side, cells // side**2], -1)
-    points = (corner + step.rng.random((len(cells), 3))) * (2 * BOX / side) - BOX
-    density, _ = density_of(params, config, torch.from_numpy(points.astype(np.float32)))
+    places = (corner + step.rng.random((len(cells), 3))) / side
+    density, _ = density_in(params, config, torch.from_numpy(places.astype(np.float32)))
     flat, where = grids["occupancy"].reshape(-1), torch.from_numpy(cells)
     flat[where] = torch.maximum(FADE * flat[where], density)

@@ -30,7 +30,8 @@ def kernels(
         if "splat_pixels_per_second" in row:
             more = (
                 f", {row['consulted_per_pixel']:.0f} splats consulted a pixel, "
-                f"{row['splat_pixels_per_second'] / 1e6:.0f} M splat-pixels/s"
+                f"{row['splat_pixels_per_second'] / 1e6:.0f} M splat-pixels/s, with absgrad "
+                f"{row['absgrad_seconds'] * 1e3:.2f} ms"
             )
         if "ns_per_pixel_tick" in row:
             more = f", {row['ticks_per_second']:.0f} ticks/s, {row['ns_per_pixel_tick']:.2f} ns a pixel and tick"

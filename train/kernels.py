@@ -143,8 +143,11 @@ def render_backward(
     arrays: Sequence[np.ndarray],
     image_grad: np.ndarray,
     alpha_grad: np.ndarray,
+    absgrad: np.ndarray | None = None,
 ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
     """Gradients of what `render_forward` drew, given those of the image and of alpha.
+
+    `absgrad` [N,2], where given, gets the sums over pixels of |d loss / d screen position|, in loss per pixel.
 
     Returns:
         (gradients of the five arrays; of the screen positions [N,2], in loss per pixel; of cam_from_world [3,4],
@@ -155,7 +158,7 @@ def render_backward(
     screen, camera = np.empty((len(logits), 2), np.float32), np.empty(12, np.float64)
     _native.render_backward(
         state, means, quats, log_scales, logits, sh, image_grad, alpha_grad,
-        g_means, g_quats, g_log_scales, g_logits, g_sh, screen, camera,
+        g_means, g_quats, g_log_scales, g_logits, g_sh, screen, camera, absgrad,
     )  # fmt: skip
     return grads, screen, camera.reshape(3, 4)
 

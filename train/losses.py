@@ -13,6 +13,7 @@ from torch import Tensor
 
 from spikerig import _native
 from spikerig.dataset.errors import UsageError
+from spikerig.train.converter import respond
 
 DOMAINS = {"encoded": 0, "linear": 1, "luma": 2, "naive": 2}  # what the gray of a picture is compared as
 REC601 = (0.299, 0.587, 0.114)
@@ -96,9 +97,12 @@ def gray_of(image: Tensor, gray: Tensor, domain: str) -> Tensor:
     return srgb_from_linear(y) if domain == "encoded" else y
 
 
-def tfs_oracle(image: Tensor, texture: Tensor, weight: Tensor, gray: Tensor, domain: str = "encoded") -> Tensor:
+def tfs_oracle(
+    image: Tensor, texture: Tensor, weight: Tensor, gray: Tensor, domain: str = "encoded", heights: Tensor | None = None
+) -> Tensor:
     """The definition of `tfs_loss`."""
-    residual = torch.where(weight > 0, gray_of(image, gray, domain) - texture, 0.0)
+    seen = gray_of(image, gray, domain)
+    residual = torch.where(weight > 0, (seen if heights is None else respond(seen, heights)) - texture, 0.0)
     return (weight * residual * residual).sum()
 
 
@@ -117,7 +121,9 @@ class _Tfs(torch.autograd.Function):
         return ctx.grad * grads[0], None, None, by_gray, None
 
 
-def tfs_loss(image: Tensor, texture: Tensor, weight: Tensor, gray: Tensor, domain: str = "encoded") -> Tensor:
+def tfs_loss(
+    image: Tensor, texture: Tensor, weight: Tensor, gray: Tensor, domain: str = "encoded", heights: Tensor | None = None
+) -> Tensor:
     """The TfS term of one rendered picture against one texture: a weighted mean of squared residuals.
 
     Args:
@@ -126,11 +132,13 @@ def tfs_loss(image: Tensor, texture: Tensor, weight: Tensor, gray: Tensor, domai
         weight: [H,W]: `mean_weights` of the known pixels, so that the sum is a mean.
         gray: [4], weights of R, G, B and bias.
         domain: see FitConfig.tfs_domain.
+        heights: of a response curve at equally spaced grays from 0 to 1 (`converter.respond`); None: a straight line.
 
     Returns:
-        A scalar, differentiable in `image` and `gray`. Same bits for any thread count.
+        A scalar, differentiable in `image`, `gray` and `heights`. Same bits for any thread count.
 
     Edges: a pixel of weight 0 contributes nothing, whatever its texture holds.
+    Cost: with `heights` by plain torch, several times the kernel's.
     Source: paper, Eq. TfS, as a mean. Oracle: `tfs_oracle`.
     """
     if domain not in DOMAINS:
@@ -140,8 +148,8 @@ def tfs_loss(image: Tensor, texture: Tensor, weight: Tensor, gray: Tensor, domai
             "the TfS term needs image[H,W,3], texture[H,W], weight[H,W] and gray[4]",
             value=tuple(tuple(t.shape) for t in (image, texture, weight, gray)),
         )
-    if image.device.type != "cpu" or image.dtype != torch.float32:
-        return tfs_oracle(image, texture, weight, gray, domain)
+    if heights is not None or image.device.type != "cpu" or image.dtype != torch.float32:
+        return tfs_oracle(image, texture, weight, gray, domain, heights)
     return _Tfs.apply(image.contiguous(), texture, weight, gray.contiguous(), domain)  # type: ignore[return-value]
 
 
@@ -167,8 +175,8 @@ def ratio_target(
 
     Args:
         frame_light: [H,W,3] linear light of the blurry frame.
-        texture: [H,W] texture at the instant, white at 1.
-        mean: [H,W] texture of the whole exposure, same units.
+        texture: [H,W] texture at the instant, white at 1; of colour spikes [H,W,3].
+        mean: texture of the whole exposure, same units and shape.
         known: bool[H,W] where both are known; the ratio is 1 elsewhere.
         eps: added to both, so that ratios of small counts stay near 1.
         low, high: bounds of the ratio.
@@ -179,5 +187,5 @@ def ratio_target(
     Source: the double-integral idea of EDI with counts instead of log events; gain and fixed pattern cancel.
     """
     ratio = ((texture + eps) / (mean + eps)).clamp(low, high)
-    ratio = torch.where(known, ratio, 1.0)
-    return srgb_from_linear((frame_light * ratio[..., None]).clamp(0.0, 1.0))
+    ratio = torch.where(known[..., None], ratio if ratio.ndim == 3 else ratio[..., None], 1.0)
+    return srgb_from_linear((frame_light * ratio).clamp(0.0, 1.0))

@@ -50,6 +50,7 @@ class SplatModel:
             sh_degree=sh_degree,
             antialias=self.config.antialias,
             near=NEAR,
+            **({"absgrad": True} if self.config.absgrad else {}),
         )
 
     def picture(self, cam_from_world: Floats) -> np.ndarray:

@@ -135,7 +135,7 @@ def _colour(splats: Splats, index: torch.Tensor, pose: torch.Tensor, degree: int
 
 def shares(p: Footprints, pixels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Unclipped alpha [P,M] of each footprint at pixel centres [P,2], and the light [P,M] that reaches it."""
-    dx, dy = (pixels[:, None, :] - p.centre[None]).unbind(-1)
+    dx, dy = (pixels[:, None, :] - p.centre).unbind(-1)
     power = ((p.factor[:, 0] * dx + p.factor[:, 1] * dy) ** 2 + (p.factor[:, 2] * dy) ** 2) / 2
     free = (p.log_opacity - power).exp()
     alpha = torch.where(free >= ALPHA_MIN, free.clamp(max=ALPHA_MAX), 0.0)
@@ -163,6 +163,19 @@ def raster(p: Footprints, width: int, height: int, background: torch.Tensor) -> 
     """Every footprint at every pixel: image [H,W,3], alpha [H,W]. The definition; memory M x H x W."""
     image, alpha = blend(p, centres(0, width, 0, height, p.centre.dtype), background)
     return image.reshape(height, width, 3), alpha.reshape(height, width)
+
+
+def absgrad(
+    p: Footprints, width: int, height: int, background: torch.Tensor, image_grad: torch.Tensor, alpha_grad: torch.Tensor
+) -> torch.Tensor:
+    """Sums over pixels [M,2] of |d loss / d centre|, given d loss / d image and alpha: each pixel gets its own centres.
+
+    Source: AbsGS (Ye et al. 2024): signed sums cancel where the two sides of a large splat pull apart.
+    """
+    own = p.centre.detach().expand(width * height, -1, -1).clone().requires_grad_()
+    image, alpha = blend(replace(p, centre=own), centres(0, width, 0, height, p.centre.dtype), background)
+    loss = (image * image_grad.reshape(-1, 3)).sum() + (alpha * alpha_grad.reshape(-1)).sum()
+    return torch.autograd.grad(loss, own)[0].abs().sum(0)
 
 
 def raster_tiled(p: Footprints, width: int, height: int, background: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

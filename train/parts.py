@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from torch import Tensor
@@ -23,12 +24,16 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
+Draw = Callable[["TrainView", Tensor], list[Tensor]]  # (view, pose) -> renders
+
+
 @dataclass(frozen=True, slots=True)
 class Part:
     """One piece; every hook may be None, which means that it changes nothing.
 
     Args:
         name: its parameters are called `name:...` in State.params and checkpoints.
+        remark: told with every fit and kept in run.json.
         instants: config -> fractions of the exposure that are rendered beside those of colour and textures.
         read: (scene, view, config) -> pictures [H,W,...] by name, kept as TrainView.beside (of a batch of pixels, the
             values there).
@@ -38,10 +43,12 @@ class Part:
             place, by the parameters' gradients.
         pose: (params, view, phase, pose, config) -> pose of that instant, [3,4] or [B,3,4].
         expose: (params, view, picture, config) -> the exposed picture as the camera would hand it out.
+        draw: (params, draw, view, pose, step, fit.Task) -> the renders that stand for draw(view, pose), each [H,W,3].
         loss: (fit.State, fit.Task, view, pictures by phase, step) -> terms that are added to the loss.
     """
 
     name: str
+    remark: str = ""
     instants: Callable[[FitConfig], tuple[float, ...]] | None = None
     read: Callable[[SceneFile, View, FitConfig], dict[str, Tensor]] | None = None
     start: Callable[[Any], Tensors] | None = None
@@ -49,16 +56,35 @@ class Part:
     descend: Callable[[Tensors, dict[str, tuple[Tensor, Tensor]], FitConfig, float], None] | None = None
     pose: Callable[[Tensors, TrainView, float, Tensor, FitConfig], Tensor] | None = None
     expose: Callable[[Tensors, TrainView, Tensor, FitConfig], Tensor] | None = None
+    draw: Callable[[Tensors, Draw, TrainView, Tensor, Step, Any], list[Tensor]] | None = None
     loss: Callable[[Any, Any, TrainView, dict[float, Tensor], Step], list[Tensor]] | None = None
 
 
 def parts_of(config: FitConfig) -> tuple[Part, ...]:
     """The parts that a config asks for, in the order in which they act."""
-    found: list[Any] = []  # of Part, which a type checker sees under two names here
+    found: list[Any] = []  # Any: a module that is checked by its file name has a Part of its own
+    if config.exposure != "off":
+        from spikerig.train.exposure import AFFINE, BILATERAL
+
+        found.append(AFFINE if config.exposure == "affine" else BILATERAL)
     if config.trajectory != "given":
         from spikerig.train.path import PART as PATH
 
         found.append(PATH)
+    if config.event_weight > 0:
+        from spikerig.train.eventloss import EVENTS
+
+        found.append(EVENTS)
+    if config.kernel_points > 0:
+        from spikerig.train.blurkernel import KERNEL
+
+        found.append(KERNEL)
+    if config.restore_instants > 0:
+        from spikerig.train import restore
+
+        found.append(
+            Part("restore", instants=restore.instants, read=restore.read, start=restore.start, loss=restore.loss)
+        )
     return tuple(found)
 
 
@@ -93,6 +119,20 @@ def pose_of(params: Tensors, view: TrainView, phase: float, config: FitConfig) -
         if part.pose is not None:
             pose = part.pose(own(part, params), view, phase, pose, config)
     return pose
+
+
+def drawn_by(params: Tensors, view: TrainView, phase: float, step: Step, task: Any, draw: Draw) -> list[Tensor]:
+    """The field's renders of an instant after all parts; `draw` is the field's own."""
+    for part in parts_of(task.config):
+        if part.draw is not None:
+            draw = partial(_drawn, part.draw, own(part, params), draw, step, task)
+    return draw(view, pose_of(params, view, phase, task.config))
+
+
+def _drawn(
+    hook: Any, params: Tensors, draw: Draw, step: Step, task: Any, view: TrainView, pose: Tensor
+) -> list[Tensor]:
+    return hook(params, draw, view, pose, step, task)
 
 
 def exposed_by(params: Tensors, view: TrainView, picture: Tensor, config: FitConfig) -> Tensor:

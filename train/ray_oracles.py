@@ -37,3 +37,24 @@ def weights_of(density: NDArray, length: NDArray) -> tuple[Doubles, Doubles]:
         weights[:, i] = left * -np.expm1(-thick)
         left = left * np.exp(-thick)
     return weights, left
+
+
+def contract(x: NDArray) -> Doubles:
+    """Barron et al. 2022, Eq. 10, point by point [N,3]."""
+    out = np.array(x, np.float64)
+    for point in out:
+        length = np.sqrt((point**2).sum())
+        if length > 1:
+            point[:] = (2 - 1 / length) * point / length
+    return out
+
+
+def contract_jacobian(x: NDArray) -> Doubles:
+    """[N,3,3]: (2/r - 1/r^2) I + (2/r^3 - 2/r^2) x x^T / r outside the unit ball, I inside."""
+    out = np.zeros((len(x), 3, 3))
+    for n, point in enumerate(np.asarray(x, np.float64)):
+        r = np.sqrt((point**2).sum())
+        out[n] = np.eye(3)
+        if r > 1:
+            out[n] = (2 / r - 1 / r**2) * np.eye(3) + (2 / r**3 - 2 / r**2) * np.outer(point, point) / r
+    return out

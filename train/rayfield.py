@@ -99,14 +99,19 @@ class RayField:
     name: str
 
     def start(self, points: Points | None, gauge: Gauge, config: FitConfig) -> tuple[Tensors, Tensors]:
-        """Random networks; points are not used (the gauge has seen them)."""
+        """Random networks; those of nerf-fast are then taught the points, unless `init` is random or there are none."""
         if self.name == "nerf":
             from spikerig.train.vanilla import start_vanilla
 
             return start_vanilla(config)
         from spikerig.train.hashed import start_hashed
 
-        return start_hashed(config)
+        params, grids = start_hashed(config)
+        if config.init == "points" and points is not None and len(points.xyz):
+            from spikerig.train.prime import prime
+
+            prime(params, grids, gauge.inside(points.xyz), points.rgb / 255.0, config)
+        return params, grids
 
     def model(self, params: Tensors, grids: Tensors, gauge: Gauge, camera: Camera, config: FitConfig) -> RayModel:
         """Something to trace rays with."""
@@ -131,16 +136,18 @@ class RayField:
             ", ".join(dict.fromkeys(view.name for view in views)),
             torch.cat([view.frame.reshape(-1, 3)[p] for view, p in pairs])[:, None],
             valid,
-            {phase: _instant([(v.instants[phase], p) for v, p in pairs]) for phase in views[0].instants},
+            {phase: _instant([(v, v.instants[phase], p) for v, p in pairs]) for phase in views[0].instants},
             torch.cat(taken),
             torch.cat([view.which.expand(len(p)) for view, p in pairs]),
             {name: torch.cat([v.beside[name].flatten(0, 1)[p] for v, p in pairs])[:, None] for name in views[0].beside},
+            _lateness(pairs),
         )
 
     def draw(self, model: RayModel, view: TrainView, pose: Tensor, step: Step) -> list[Tensor]:
         """The pixels from their poses, by every network: pictures of B rows and one column."""
         if view.pixels is None:
             raise ValueError("a batch of pixels, as look() makes it")
+        step.drawn.append(len(view.pixels))
         rays = rays_of(model.camera, pose, view.pixels)
         return [seen.colour[:, None].contiguous() for seen in model.trace(rays, step.background, step.rng)]
 
@@ -151,6 +158,9 @@ class RayField:
     def regularise(self, params: Tensors, config: FitConfig) -> list[Tensor]:
         """Nothing."""
         return []
+
+    def sense(self, config: FitConfig, step: Step) -> None:
+        """Nothing."""
 
     def tend(self, state: State, config: FitConfig, step: Step) -> None:
         """The occupancy grid follows the density."""
@@ -178,17 +188,26 @@ def threads_of(config: FitConfig) -> int:
     return RayField(config.field).torch_threads()
 
 
-def _instant(parts: list[tuple[Instant, Tensor]]) -> Instant:
+def _lateness(pairs: list[tuple[TrainView, Tensor]]) -> Tensor | None:
+    """[B,1] of some pixels of some views, None where no view has a rolling shutter."""
+    if all(view.late is None for view, _ in pairs):
+        return None
+    return torch.cat([torch.zeros(len(p)) if v.late is None else v.late.reshape(-1)[p] for v, p in pairs])[:, None]
+
+
+def _instant(parts: list[tuple[TrainView, Instant, Tensor]]) -> Instant:
     """Some pixels of some views at one instant: a pose each, textures and ratio targets of these pixels."""
+    from spikerig.train.rolling import poses_at
     from spikerig.train.targets import Instant
 
-    poses = torch.cat([instant.pose.expand(len(p), 3, 4) for instant, p in parts])
+    poses = torch.cat([poses_at(instant.pose, view.late, p) for view, instant, p in parts])
     textures = []
-    for each in zip(*(instant.textures for instant, _ in parts), strict=True):
+    for each in zip(*(instant.textures for _, instant, _ in parts), strict=True):
         taken = [
-            (light.reshape(-1)[p], weight.reshape(-1)[p]) for (light, weight), (_, p) in zip(each, parts, strict=True)
+            (light.reshape(-1)[p], weight.reshape(-1)[p])
+            for (light, weight), (_, _, p) in zip(each, parts, strict=True)
         ]
         light, weight = (torch.cat(column)[:, None].contiguous() for column in zip(*taken, strict=True))
         textures.append((light, mean_weights(weight > 0)))
-    ratios = [instant.ratio.reshape(-1, 3)[p] for instant, p in parts if instant.ratio.numel()]
+    ratios = [instant.ratio.reshape(-1, 3)[p] for _, instant, p in parts if instant.ratio.numel()]
     return Instant(poses, tuple(textures), torch.cat(ratios)[:, None] if ratios else torch.zeros(0, dtype=torch.half))

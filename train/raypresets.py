@@ -13,9 +13,9 @@ NERF: dict[str, dict[str, Any]] = {
     "paper": {"steps": 200_000},
 }
 FAST: dict[str, dict[str, Any]] = {
-    "draft": {"steps": 3000, "fine": 32, "table_log2": 16, "finest": 256},
-    "standard": {"steps": 10_000, "fine": 48, "table_log2": 17, "finest": 512},
-    "full": {"steps": 30_000, "fine": 64, "table_log2": 19, "finest": 1024, "grid_levels": 16},
+    "draft": {"steps": 3000, "probes": 32, "fine": 8, "table_log2": 16, "finest": 512},
+    "standard": {"steps": 10_000, "probes": 48, "fine": 12, "table_log2": 17, "finest": 512},
+    "full": {"steps": 30_000, "probes": 64, "fine": 24, "table_log2": 19, "finest": 1024, "grid_levels": 16},
 }
 
 

@@ -21,6 +21,7 @@ from spikerig.train.field import Model
 from spikerig.train.fields import field_of
 from spikerig.train.gauge import Gauge
 
+DIVERGED = "diverged.safetensors"  # the state before a step that left something not finite
 CHECKPOINT, RECORD, HISTORY, PATHS = "checkpoint.safetensors", "run.json", "history.json", "paths.json"
 
 
@@ -74,6 +75,7 @@ def prepare_folder(out: Path, *, force: bool, resume: bool) -> None:
     if force and not resume:
         for file in files:
             file.unlink(missing_ok=True)
+    (out / DIVERGED).unlink(missing_ok=True)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

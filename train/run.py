@@ -10,17 +10,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from spikerig.dataset.errors import DataError, UsageError
+from spikerig.dataset.errors import DataError, NumericsError, UsageError
 from spikerig.dataset.terminal import Progress, note
 from spikerig.train import record as records
 from spikerig.train.bridge import Cameras, bridge, true_pose
 from spikerig.train.config import FitConfig
+from spikerig.train.converter import converter
 from spikerig.train.fields import field_of
 from spikerig.train.fit import State, Task, check_finite, load_state, new_state, save_state, torch_threads, train
 from spikerig.train.gauge import gauge_of
+from spikerig.train.guard import Guard, copy_state, reproducer
 from spikerig.train.model import SplatModel, check_pinhole
+from spikerig.train.parts import parts_of
 from spikerig.train.path import MIDDLE, paths
 from spikerig.train.ply import export_ply
+from spikerig.train.restorer import check_restorer
 from spikerig.train.score import Exam, mean_psnr, novel_views
 from spikerig.train.targets import load_targets
 from spikerig.train.trajectory import PATH_PHASES
@@ -30,6 +34,7 @@ if TYPE_CHECKING:
     from spikerig.dataset.store import SceneFile
 
 MOST_EXAMS = 8  # held-out views looked at for the curve
+LOOKS = (1 / 80, 1 / 40, 1 / 20, *(k / 10 for k in range(1, 10)))  # fractions of a run, closer where dB rise fast
 
 
 def run_fit(
@@ -53,7 +58,7 @@ def run_fit(
         out: folder of the run.
         resume: go on from its checkpoint, where there is one; the config must be the same.
         force: replace an earlier run.
-        eval_every: seconds of training between held-out scores; None = a tenth of the run, 0 = only at the end.
+        eval_every: seconds of training between held-out scores; None = at LOOKS, 0 = only at the end.
         checkpoint_every: seconds between checkpoints.
         ply: write splats.ply at the end.
         score_on: scene whose held-out views make the curve; None: those of the scene itself.
@@ -65,6 +70,8 @@ def run_fit(
     from spikerig.dataset.store import open_scene
 
     field_of(config).check(config)  # a missing extra is told before minutes of preparation
+    if config.colour_target == "restored":
+        check_restorer(config)
     if ply and config.field != "splat":
         raise UsageError("only splats can be written as .ply", value=f"field {config.field}", next="leave out --ply")
     begin = time.monotonic()
@@ -78,12 +85,15 @@ def run_fit(
         known = {name: true_pose(scene, name) for name in scene.train} if config.moves_cameras else {}
     record["prepare_seconds"] = time.monotonic() - begin
     _tell(task, record)
-    watch = _Watch(out, task, record, exams, known, eval_every, checkpoint_every)
+    watch = _Watch(out, task, record, exams, known, eval_every, checkpoint_every, Guard(copy_state(state)))
     watch.write(state)
     if state.step == 0:
         watch.look(state, 0.0)
     try:
         train(state, task, after=watch)
+    except NumericsError as error:
+        note("not finite: looking for the first step that broke")
+        raise reproducer(out, watch.guard.kept, task, error) from error
     except KeyboardInterrupt:
         watch.save(state)
         note(f"stopped at step {state.step}; --resume goes on")
@@ -114,11 +124,37 @@ def prepare(
     record = records.new_record(config, about, scene.camera, gauge)
     record |= {
         "gray": None if found is None else found.as_json(),
+        "filters": None if targets.filters is None else targets.filters.as_json(),
         "effective_tfs_weight": task.weight,
-        "remarks": list(targets.remarks),
-        "renders_per_step": {"ratio": 1 if targets.ratio else 0, "average": len({*targets.colour, *targets.tfs})},
+        "remarks": [*targets.remarks, *(part.remark for part in parts_of(config) if part.remark)],
+        "deblurred": targets.deblurred,
+        "renders_per_step": {
+            "ratio": 1 if targets.ratio else 0,
+            "average": len({*targets.colour, *targets.tfs, *targets.also}),
+        },
     }
     return task, record
+
+
+def prepare_again(record: dict[str, Any], config: FitConfig, moved: Path | None = None) -> Task:
+    """The task of a stored run, from its run.json and config.
+
+    Args:
+        record: run.json.
+        config: of the run.
+        moved: where the scene is now; None: where it was.
+
+    Raises:
+        DataError: another scene than the run's, or none.
+    """
+    from spikerig.dataset.store import open_scene
+
+    path = Path(record["scene"]["path"]) if moved is None else moved
+    with open_scene(path) as scene, torch_threads():
+        if record["scene"]["sha256"] != records.scene_hash(path):
+            raise DataError("this is not the scene the run was made from", value=path, next="--scene FILE")
+        points_of = record.get("points_of")
+        return prepare(scene, path, config, _points(Path(points_of)) if points_of else None)[0]
 
 
 def _start(
@@ -135,6 +171,8 @@ def _start(
     earlier = records.read_json(out / records.RECORD)
     if earlier["scene"]["sha256"] != records.scene_hash(scene.path):
         raise DataError("this is not the scene the run began with", value=scene.path, next="--force starts anew")
+    if (earlier.get("deblurred") or {}).get("sha256") != (task.targets.deblurred or {}).get("sha256"):
+        raise DataError("this is not the restorer the run began with", value=task.config.restorer)
     if earlier.get("points_of") != points_of:
         raise UsageError("a run goes on with the points it began with", value=points_of, expected=earlier["points_of"])
     if earlier["machine"]["isa"] != _isa():
@@ -168,7 +206,8 @@ def _tell(task: Task, record: dict[str, Any]) -> None:
     config = task.config
     length = f"{config.seconds:g} s" if config.seconds > 0 else f"{config.steps} steps"
     note(f"{config.method} on {record['scene']['name']}: {len(task.targets.views)} views, {length}, seed {config.seed}")
-    note(f"  pose label '{config.pose_label}'; {len(set(task.targets.colour))} sub-pose(s) a view for colour")
+    instants = len({*task.targets.colour, *task.targets.also})
+    note(f"  pose label '{config.pose_label}'; {instants} sub-pose(s) a view for colour")
     if config.tfs_weight > 0:
         note(
             f"  TfS: w = {config.tfs_weight:g} read as '{config.weight_reading}': {task.weight:g} on means; "
@@ -177,6 +216,11 @@ def _tell(task: Task, record: dict[str, Any]) -> None:
     if (gray := task.targets.gray) is not None and config.tfs_weight > 0:
         k = ", ".join(f"{x:.3f}" for x in gray.weights)
         note(f"  gray ({gray.how}): {k}, bias {gray.bias:+.4f}, white = {gray.white:.3f} spikes a tick")
+    if (sharper := task.targets.deblurred) is not None:
+        note(
+            f"  pictures deblurred first: {sharper['how']}, "
+            + ", ".join(f"{k} {v}" for k, v in sharper.items() if k != "how")
+        )
     for remark in record["remarks"]:
         note(f"  note: {remark}")
 
@@ -192,6 +236,7 @@ class _Watch:
     known: Cameras  # where the world of the exams has the training cameras, where the fit moves them
     eval_every: float | None
     checkpoint_every: float
+    guard: Guard
     looked: float = 0.0
     saved: float = field(default_factory=time.monotonic)
     pause: float = 0.0  # after a save that took long: it may cost a twentieth of the time, not more
@@ -199,6 +244,7 @@ class _Watch:
 
     def __call__(self, state: State, fraction: float, loss: float) -> None:
         config = self.task.config
+        self.guard(state)
         if self.bar is None:
             total = round(config.seconds) if config.seconds > 0 else config.steps
             self.bar = Progress("training", total, "s" if config.seconds > 0 else "steps")
@@ -212,7 +258,7 @@ class _Watch:
 
     def _due(self, state: State, fraction: float) -> bool:
         if self.eval_every is None:
-            return int(fraction * 10) > int(self.looked * 10)
+            return any(self.looked < at <= fraction for at in LOOKS)
         last = state.history[-1]["seconds"] if state.history else 0.0
         return self.eval_every > 0 and state.seconds - last >= self.eval_every
 
@@ -220,6 +266,7 @@ class _Watch:
         """Score the held-out views and add a point to history.json."""
         self.looked = fraction
         row: dict[str, Any] = {"seconds": state.seconds, "step": state.step, "fraction": fraction, "psnr": None}
+        row |= {"cpu_seconds": state.cpu, "renders": state.renders}
         if self.exams:
             row["psnr"] = mean_psnr(self.task.model(state), self._brought_over(state))
         state.history.append(row)
@@ -263,12 +310,17 @@ def _finish(state: State, watch: _Watch, record: dict[str, Any], ply: bool) -> d
         "status": "complete",
         "steps": state.step,
         "train_seconds": state.seconds,
+        "train_cpu_seconds": state.cpu,
+        "renders": state.renders,
+        "renders_of": "pictures" if watch.task.config.field == "splat" else "rays",
         "parameters": sum(p.numel() for p in state.params.values()),
     }
     if "means" in state.params:
         done["splats"] = len(state.params["means"])
     if "gray" in state.params:
-        done["learned_gray"] = state.params["gray"].tolist()
+        gray, heights = converter(watch.task.config.gray, state.params["gray"].detach(), watch.task.gray)
+        done["learned_gray"] = gray.tolist()
+        done["learned_response"] = None if heights is None else heights.tolist()
     watch.write(state, done)
     model = watch.task.model(state)
     if ply and isinstance(model, SplatModel):
@@ -281,7 +333,8 @@ def _finish(state: State, watch: _Watch, record: dict[str, Any], ply: bool) -> d
     return {
         "run": str(watch.out), "method": watch.task.config.method, **done,
         "pose_label": watch.task.config.pose_label, "psnr": psnr, "seed": watch.task.config.seed,
-        "effective_tfs_weight": watch.task.weight, "gray": record["gray"], "remarks": record["remarks"],
+        "effective_tfs_weight": watch.task.weight, "remarks": record["remarks"],
+        "gray": record["gray"], "filters": record["filters"],
         "prepare_seconds": record["prepare_seconds"], "model_sha256": model_hash(state),
     }  # fmt: skip
 

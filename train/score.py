@@ -17,10 +17,11 @@ from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.scene import Floats
 from spikerig.dataset.terminal import note
 from spikerig.train import metrics
-from spikerig.train.bridge import Bridge, Cameras, bridge, stored_cameras, true_pose
+from spikerig.train.bridge import Bridge, Cameras, bridge, estimated_poses, stored_cameras, true_pose
 from spikerig.train.field import Model
 from spikerig.train.metrics import SSIM_VARIANTS, rounded
 from spikerig.train.model import BACKGROUNDS, SplatModel
+from spikerig.train.parts import parts_of
 from spikerig.train.quality import Judges, compare, judge_alone, means
 from spikerig.train.realign import STEPS, realign
 from spikerig.train.targets import truth_pose
@@ -87,7 +88,7 @@ def bring_over(
     """
     if trained is None:
         return list(novel), list(blurred), None
-    estimated = estimated or "poses" in scene.info
+    estimated = estimated or estimated_poses(scene)
     found = bridge({n: true_pose(scene, n) for n in scene.train}, trained, estimated=estimated)
     if estimated:
         novel = [replace(e, pose=_true_exam_pose(scene, e)) for e in novel]
@@ -255,6 +256,7 @@ def score_run(
         "lpips_variant": judges.about()["lpips"],
         "rounding": metrics.ROUNDING,
         "background": list(BACKGROUNDS[model.config.background]),
+        "remarks": [part.remark for part in parts_of(model.config) if part.remark],
         "method": model.config.method,
         "preset": model.config.preset,
         "field": model.config.field,

@@ -94,7 +94,7 @@ def trained_cameras(run: Run) -> tuple[Cameras | None, bool]:
     import numpy as np
 
     from spikerig.dataset.store import open_scene
-    from spikerig.train.bridge import stored_cameras
+    from spikerig.train.bridge import estimated_poses, stored_cameras
 
     if (moved := run.record.get("cameras")) is not None:
         try:
@@ -108,7 +108,7 @@ def trained_cameras(run: Run) -> tuple[Cameras | None, bool]:
         note(f"note: {run.scene} is gone, so poses are taken to be of the world the run was trained in")
         return None, False
     with open_scene(run.scene) as scene:
-        return stored_cameras(scene), "poses" in scene.info
+        return stored_cameras(scene), estimated_poses(scene)
 
 
 def _write(out: Path, run: Run, scene: Any, renders: dict[str, Any], judges: Any) -> Path:
@@ -158,4 +158,6 @@ def _tell(result: dict[str, Any]) -> None:
             f"{near['apart_deg_median']:.3f} degrees, {100 * near['apart_share_of_extent_median']:.2f} % of the extent"
         )
         note(f"poses brought over by {near['training_cameras']} training cameras, which are apart by {apart} (medians)")
+    for remark in result["remarks"]:
+        note(f"note: {remark}")
     note(f"method {result['method']}, pose label '{result['pose_label']}', SSIM {result['ssim_variant']}")

@@ -57,12 +57,14 @@ class Rendered:
         radii: [N] half size of each footprint's box in pixels, 0 where culled.
         means2d_probe: [N,2] zeros; after backward its `.grad` holds d loss / d screen position, in loss per pixel
             (what densification watches). None when no gradient is asked for.
+        absgrad_probe: the same for the sum over pixels of |d loss / d screen position|; None unless asked for.
     """
 
     image: torch.Tensor
     alpha: torch.Tensor
     radii: torch.Tensor
     means2d_probe: torch.Tensor | None
+    absgrad_probe: torch.Tensor | None = None
 
     @property
     def visible(self) -> torch.Tensor:
@@ -72,7 +74,9 @@ class Rendered:
 
 class _Render(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, settings: tuple[Any, ...], probe: Any, pose: torch.Tensor, *tensors: torch.Tensor) -> Any:
+    def forward(
+        ctx: Any, settings: tuple[Any, ...], probe: Any, absolute: Any, pose: torch.Tensor, *tensors: torch.Tensor
+    ) -> Any:
         intrinsics, width, height, background, sh_degree, antialias, near = settings
         arrays = _arrays(tensors)
         camera = kernels.camera_block(intrinsics, width, height, pose, background, near)
@@ -81,7 +85,7 @@ class _Render(torch.autograd.Function):
         ctx.mark_non_differentiable(out[2])
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*tensors)
-        ctx.state, ctx.pose = state, (pose.dtype, pose.device)
+        ctx.state, ctx.pose, ctx.absgrad = state, (pose.dtype, pose.device), absolute is not None
         return out
 
     @staticmethod
@@ -90,10 +94,13 @@ class _Render(torch.autograd.Function):
         width, height = ctx.state.width, ctx.state.height
         shapes = ((image_grad, (height, width, 3)), (alpha_grad, (height, width)))
         by_image, by_alpha = (np.zeros(size, np.float32) if g is None else g.contiguous().numpy() for g, size in shapes)
-        grads, screen, camera = kernels.render_backward(ctx.state, _arrays(ctx.saved_tensors), by_image, by_alpha)
+        arrays = _arrays(ctx.saved_tensors)
+        absolute = np.empty((len(arrays[3]), 2), np.float32) if ctx.absgrad else None
+        grads, screen, camera = kernels.render_backward(ctx.state, arrays, by_image, by_alpha, absolute)
         dtype, device = ctx.pose
         pose_grad = torch.from_numpy(camera).to(device, dtype)
-        return None, torch.from_numpy(screen), pose_grad, *(torch.from_numpy(g) for g in grads)
+        sums = None if absolute is None else torch.from_numpy(absolute)
+        return None, torch.from_numpy(screen), sums, pose_grad, *(torch.from_numpy(g) for g in grads)
 
 
 def _arrays(tensors: Sequence[torch.Tensor]) -> list[np.ndarray]:
@@ -113,6 +120,7 @@ def render(
     sh_degree: int | None = None,
     antialias: bool = False,
     near: float = 0.01,
+    absgrad: bool = False,
 ) -> Rendered:
     """Draw splats with one camera; differentiable in the splats' tensors and in cam_from_world.
 
@@ -126,9 +134,10 @@ def render(
         sh_degree: degree used, at most the stored one; None: the stored one.
         antialias: Mip 2D compensation (opacity x sqrt(det0 / det), not below 0.005) of the 0.3 pixel^2 dilation.
         near: splats with a centre nearer than this along z, world units, are dropped.
+        absgrad: also watch the sum over pixels of |d loss / d screen position| (`absgrad_probe`).
 
     Returns:
-        image, alpha, radii and the probe for densification.
+        image, alpha, radii and the probes for densification.
 
     Raises:
         UsageError: wrong shape, type, degree or camera.
@@ -137,7 +146,7 @@ def render(
     Edges: no splats or none visible gives the background and alpha 0. A splat leaves a pixel untouched where its
         alpha < 1/255; alpha is at most 0.99 (no gradient where clipped); a pixel is finished when less than 1.1e-4
         of the light is left. Splats of equal float32 depth keep their order. Same bits for any thread count.
-    Cost: measured by `spikerig cost kernels`.
+    Cost: measured by `spikerig cost kernels`, with absgrad too; not asked for, it costs nothing.
     Source: Kerbl et al. 2023; Zwicker et al. 2001 (EWA); Yu et al. 2024 (Mip-Splatting, 2D filter).
     """
     rows = splats.sh.shape[1] if splats.sh.ndim == 3 else 0
@@ -150,9 +159,10 @@ def render(
     degree = SH_ROWS[rows] if sh_degree is None else sh_degree
     pose = cam_from_world if isinstance(cam_from_world, torch.Tensor) else torch.as_tensor(np.asarray(cam_from_world))
     tensors = tuple(splats.tensors().values())
-    probe = None
+    probe = absolute = None
     if torch.is_grad_enabled() and (pose.requires_grad or any(t.requires_grad for t in tensors)):
         probe = torch.zeros((len(splats), 2), dtype=torch.float32, requires_grad=True)
+        absolute = torch.zeros_like(probe, requires_grad=True) if absgrad else None
     settings = (K, int(width), int(height), tuple(background), degree, antialias, float(near))
-    image, alpha, radii = _Render.apply(settings, probe, pose, *tensors)  # type: ignore[misc]
-    return Rendered(image, alpha, radii, probe)
+    image, alpha, radii = _Render.apply(settings, probe, absolute, pose, *tensors)  # type: ignore[misc]
+    return Rendered(image, alpha, radii, probe, absolute)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,21 +12,23 @@ from numpy.typing import NDArray
 
 from spikerig.calib.straight import Straight, straight_of
 from spikerig.dataset.bayer import bayer_of
-from spikerig.dataset.clocktime import ClockModel
-from spikerig.dataset.errors import DataError, UsageError
+from spikerig.dataset.errors import DataError, NumericsError, UsageError
 from spikerig.dataset.scene import Floats, View
-from spikerig.dataset.spikes import SpikeStream
 from spikerig.dataset.terminal import Progress
+from spikerig.train import rolling
+from spikerig.train.arms import align
 from spikerig.train.config import FitConfig
+from spikerig.train.deblurred import Deblurred, deblurred, frame_light
+from spikerig.train.filters import Filters, check_colour, solve_filters
 from spikerig.train.gauge import Gauge
 from spikerig.train.gray import Gray, Pairs, solve
 from spikerig.train.losses import mean_weights, ratio_target, srgb_from_linear
 from spikerig.train.parts import parts_of
+from spikerig.train.spikelight import average_texture, exposures, light_at, textures_at
 from spikerig.train.trajectory import PATH_PHASES, given_pose, phases, pose_at
 
 if TYPE_CHECKING:
     from spikerig.dataset.store import SceneFile
-    from spikerig.dataset.texture import Texture
 
 NEEDS_TRUTH = "a simulated scene (spikerig sim capture); real scenes have no sharp truth"
 
@@ -52,6 +54,9 @@ class TrainView:
 
     Or B pixels of some views, as pictures of B rows and one column: then `pixels` int64[B] says which (row * width +
     column), `which` is int64[B], and an instant's pose is [B,3,4].
+
+    `late` (rolling shutter, fields of rays): how many exposures after the middle row a pixel was exposed, float32[H,W];
+    an instant's pose is then [K,3,4], of the first pixel read to the last. Of a batch: [B,1].
     """
 
     name: str
@@ -61,6 +66,7 @@ class TrainView:
     pixels: torch.Tensor | None = None
     which: torch.Tensor = field(default_factory=lambda: torch.zeros(1, dtype=torch.int64))
     beside: dict[str, torch.Tensor] = field(default_factory=dict)
+    late: torch.Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +74,8 @@ class Targets:
     """All training views, the instants each term uses (fractions of the exposure), the converter, remarks.
 
     `also`: further instants that parts ask for. `given`: where cameras move, the poses [N,5,3,4] of the world that the
-    fit was given at PATH_PHASES.
+    fit was given at PATH_PHASES. `deblurred`: how pictures were deblurred first, for run.json. `filters`: of
+    colour spikes, in place of `gray`.
     """
 
     views: tuple[TrainView, ...]
@@ -79,6 +86,8 @@ class Targets:
     remarks: tuple[str, ...] = field(default=())
     also: tuple[float, ...] = field(default=())
     given: Floats = field(default_factory=lambda: np.zeros((0, len(PATH_PHASES), 3, 4)))
+    deblurred: dict[str, Any] | None = None
+    filters: Filters | None = None
 
 
 def views_of_step(targets: Targets, seed: int, step: int, count: int = 1) -> list[TrainView]:
@@ -87,16 +96,6 @@ def views_of_step(targets: Targets, seed: int, step: int, count: int = 1) -> lis
     turns = range(step * count, (step + 1) * count)
     orders = {epoch: np.random.default_rng((seed, 3, epoch)).permutation(n) for epoch in {k // n for k in turns}}
     return [targets.views[orders[k // n][k % n]] for k in turns]
-
-
-def spikes_of(view: View) -> SpikeStream:
-    """The spikes of a view that must have them."""
-    if view.spikes is None:
-        raise DataError(
-            f"view '{view.name}' has no spikes, and this method trains on them",
-            next="--method plain or average needs none",
-        )
-    return view.spikes
 
 
 def truth_pose(scene: SceneFile, view: View) -> Floats:
@@ -109,80 +108,6 @@ def truth_pose(scene: SceneFile, view: View) -> Floats:
         return view.pose.cam_from_world
 
 
-def spike_tick(view: View, at_ns: float, clock: ClockModel | None) -> float:
-    """The (fractional) tick of a view's spikes at an instant of its frame's clock.
-
-    Raises:
-        DataError: the spikes are on another clock and the scene has no map to it.
-    """
-    stream = spikes_of(view)
-    if stream.clock == view.frame.clock:
-        return stream.tick_at(round(at_ns))
-    if clock is None:
-        raise DataError(
-            f"the frame and spikes of view '{view.name}' are on different clocks",
-            value=f"{view.frame.clock} and {stream.clock}",
-            expected="one clock, or the scene's map between them",
-        )
-    return stream.tick_at(int(clock.device_from_rig(np.int64(round(at_ns)))))
-
-
-def windowed_tfi(stream: SpikeStream, tick: float, window: int) -> Texture:
-    """TFI over the most intervals (1, 3 or 9: as many before as after) that fit into a window of ticks.
-
-    One interval where even three are longer. Bright pixels get the low noise of a window, dark ones no zero counts:
-    on the demo scene its error is half that of TFP over 32 ticks.
-    """
-    from spikerig.dataset.texture import Texture, tfi
-
-    first = tfi(stream, tick)
-    light, known = first.light.copy(), first.known
-    for k in (3, 9):
-        longer = tfi(stream, tick, intervals=k)
-        fits = longer.known & (k <= window * longer.light)
-        light[fits] = longer.light[fits]
-    return Texture(light, known, tick, f"tfi-window-{window}")
-
-
-def textures_at(stream: Any, tick: float, kind: str, window: int) -> list[Texture]:
-    """The textures of an instant by kind: tfp, tfi, both of them, tfi-window, or raw (the one tick's spikes)."""
-    from spikerig.dataset.texture import tfi, tfp
-
-    made: dict[str, Callable[[], list[Texture]]] = {
-        "tfp": lambda: [tfp(stream, tick, window)],
-        "tfi": lambda: [tfi(stream, tick)],
-        "both": lambda: [tfp(stream, tick, window), tfi(stream, tick)],
-        "tfi-window": lambda: [windowed_tfi(stream, tick, window)],
-        "raw": lambda: [tfp(stream, tick, 1)],
-    }
-    return made[kind]()
-
-
-def average_texture(found: list[Texture]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Mean over the textures known at each pixel: (light [H,W], known where any is)."""
-    known = np.stack([t.known for t in found])
-    light = np.where(known, np.stack([t.light for t in found]), 0).sum(0)
-    return (light / np.maximum(known.sum(0), 1)).astype(np.float32), np.asarray(known.any(0), np.bool_)
-
-
-def exposure_mean(view: View, clock: ClockModel | None) -> Texture:
-    """Spikes a tick over the whole exposure, of the raw spikes."""
-    from spikerig.dataset.texture import Texture, window_sum
-
-    stream = spikes_of(view)
-    t0, t1 = (round(spike_tick(view, view.instant_ns(phase), clock)) for phase in (0.0, 1.0))
-    if not (0 <= t0 < t1 <= stream.ticks):
-        raise DataError(
-            f"the spikes of view '{view.name}' do not cover its exposure",
-            value=f"exposure ticks {t0}..{t1}, stream 0..{stream.ticks}",
-            expected="spikes from before its start to after its end",
-            next="spikerig data verify FILE",
-        )
-    lost = any(a < t1 and b > t0 for a, b in stream.lost)
-    light = np.asarray(window_sum(stream, t0, t1), np.float32) / np.float32(t1 - t0)
-    return Texture(light, np.full(light.shape, not lost), (t0 + t1) / 2, "exposure")
-
-
 def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
     """Read the training views of a scene and prepare everything a step needs.
 
@@ -192,22 +117,28 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
         gauge: poses are given in it.
 
     Raises:
-        DataError: no training views, no spikes, no trajectory or no truth where the method needs it; a colour spike
-            camera.
-        UsageError: single spikes are asked for, and the spike arm's lens bends.
+        DataError: no training views, nothing valid in them, no spikes, no trajectory or no truth where the method
+            needs it.
+        NumericsError: true light that is not finite.
+        UsageError: single spikes are asked for, and the spike arm's lens bends; settings that colour spikes do not go
+            with; a restorer that is not there or may not run.
     Cost: a texture takes milliseconds; memory 12 bytes a pixel and view, +4 a texture, +6 a ratio instant.
     """
     if not scene.train:
         raise DataError("this scene has no training views", value=scene.name, next="spikerig data info FILE")
     if config.colour_target == "truth" and not scene.has_truth:
         raise DataError("this method trains on the sharp truth", value=scene.name, expected=NEEDS_TRUTH)
-    if config.needs_spikes and bayer_of(scene.info) is not None:
-        raise DataError(
-            "the spikes of this scene see colours, and the losses on spikes compare gray",
-            value=scene.name,
-            expected="a scene of a gray spike camera, or a method without spikes",
-        )
     straight = straight_of(scene) if config.needs_spikes else Straight()
+    bayer = bayer_of(scene.info) if config.needs_spikes else None
+    if bayer is not None:
+        check_colour(config, straight)
+    elif config.colour_weight == 0:
+        raise DataError(
+            "spikes of a gray camera do not say what colour things have",
+            value=scene.name,
+            expected="a scene of a colour spike camera ([sensor] bayer), or frames beside the spikes",
+            next="--method spikenerf",
+        )
     if config.textures == "raw" and straight.resamples:
         raise UsageError(
             "single spikes cannot be brought to the scene's camera: its spike lens bends, and they would be blended",
@@ -220,25 +151,54 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
     ratio = phases(config.ratio_instants, "midpoints", config.pose_label) if config.ratio_until > 0 else ()
     if config.ratio_until >= 1:
         colour, tfs = ratio, (ratio if tfs else ())
+    if config.restore_instants > 0 or config.colour_weight == 0:
+        colour = ()  # the part has a colour term of its own, or there is none
     parts = parts_of(config)
     also = tuple(dict.fromkeys(p for part in parts if part.instants is not None for p in part.instants(config)))
+    sharper = deblurred(scene, config)
     pairs, raw, bar = Pairs(), [], Progress("preparing views", len(scene.train), "views")
     for number, name in enumerate(scene.train):
-        raw.append(_read(scene, name, number, config, gauge, (colour, tfs, ratio, also), pairs, straight))
+        raw.append(_read(scene, name, number, config, gauge, (colour, tfs, ratio, also), pairs, straight, sharper))
         bar.step()
-    gray = solve(pairs, config.gray, scene.light_gain) if config.needs_spikes else None
-    views = tuple(_finish(each, k, config, gauge, gray, (colour, tfs, ratio)) for k, each in enumerate(raw))
+    if not any(each["valid"].any() for each in raw):
+        raise DataError(
+            "no pixel of any training view is valid",
+            value=scene.name,
+            expected="views whose two arms see something in common",
+            cause="an alignment that missed, or masks that are inverted",
+            next="spikerig data check FILE",
+        )
+    gray = solve(pairs, config.gray, scene.light_gain) if config.needs_spikes and bayer is None else None
+    filters = None if bayer is None else solve_filters(raw, bayer, config.gray, scene.light_gain)
+    remarks = _remarks(raw)
+    if gray is not None and config.align_arms != "off":
+        motion = align(raw, np.array([*gray.weights, gray.bias]), gray.white, config.align_arms)
+        pairs = Pairs()
+        for each in raw:
+            pairs.add(each["codes"], each["light"], each["mean"], each["mean_known"] & each["valid"])
+        gray = solve(pairs, config.gray, scene.light_gain)
+        x, y = motion.shift_px
+        remarks += (
+            f"frames were moved by {x:+.2f}, {y:+.2f} px to meet the spikes ({config.align_arms}; rms of the grays' "
+            f"difference {motion.rms_before:.4f} -> {motion.rms_after:.4f} of white)",
+        )
+    seen = gray if filters is None else filters
+    views = tuple(_finish(each, k, config, gauge, seen, (colour, tfs, ratio)) for k, each in enumerate(raw))
     given = [each["given"] for each in raw] if config.moves_cameras else np.zeros((0, len(PATH_PHASES), 3, 4))
-    return Targets(views, colour, tfs, ratio, gray, _remarks(raw), also, np.array(given))
+    about = None if sharper is None else sharper.about
+    return Targets(views, colour, tfs, ratio, gray, remarks, also, np.array(given), about, filters)
 
 
 def _remarks(raw: list[dict[str, Any]]) -> tuple[str, ...]:
-    rolling = sum(1 for each in raw if each["row_ns"])
-    if not rolling:
+    rolled = [each for each in raw if each["row_ns"]]
+    if not rolled:
         return ()
+    told = f"{len(rolled)} frames have a rolling shutter: "
+    if all(each["late"] is not None for each in rolled):
+        return (told + "every row has its own instant (poses, textures)",)
     return (
-        f"{rolling} frames have a rolling shutter: every row is treated as read when the middle one was "
-        "(poses, textures), so fast shake skews",
+        told + "every row is treated as read when the middle one was (poses, textures), so fast shake skews; fields "
+        "nerf and nerf-fast follow the rows where poses over the whole read-out are known",
     )
 
 
@@ -251,42 +211,58 @@ def _read(
     instants: tuple[tuple[float, ...], ...],
     pairs: Pairs,
     straight: Straight,
+    sharper: Deblurred | None,
 ) -> dict[str, Any]:
-    from spikerig.dataset.images import linear_from_srgb
-
     colour, tfs, ratio, also = instants
     view = scene.view(name, spikes=config.needs_spikes)
-    decode = np.arange(view.frame.full + 1) / view.frame.full
-    if view.frame.transfer == "srgb":
-        decode = linear_from_srgb(decode)
-    light = np.asarray(decode, np.float32)[view.frame.pixels]
+    light = frame_light(view)
+    late = None
+    if config.field != "splat" and config.colour_target != "truth" and not config.moves_cameras:
+        late = rolling.late_of(view)
+
+    def given(phase: float) -> Floats:
+        return given_pose(view, number, phase, config, gauge.scale)
+
     made: dict[str, Any] = {
         "name": name,
-        "light": light,
+        "late": late,
+        "light": light if sharper is None else sharper.light[name],
         "valid": np.array(view.valid),
         "row_ns": view.frame.row_ns,
         "pose": {
-            phase: given_pose(view, number, phase, config, gauge.scale)
+            phase: given(phase) if late is None else rolling.row_poses(view, phase, late)
             for phase in dict.fromkeys((*colour, *tfs, *ratio, *also))
         },
         "beside": {n: t for part in parts_of(config) if part.read for n, t in part.read(scene, view, config).items()},
         "textures": {},
     }
     if config.colour_target == "truth":
-        made["light"] = np.array(scene.truth_light(name), np.float32)
+        made["light"] = _finite(np.array(scene.truth_light(name), np.float32), name, scene)
         made["pose"] = dict.fromkeys(made["pose"], truth_pose(scene, view))
     if config.moves_cameras:
-        made["given"] = [given_pose(view, number, phase, config, gauge.scale) for phase in PATH_PHASES]
+        made["given"] = [given(phase) for phase in PATH_PHASES]
     if config.needs_spikes:
-        clock = scene.clock
-        mean = straight.texture(exposure_mean(view, clock))
+        (mean,) = light_at(view, 0.5, late, scene.clock, straight, exposures(view, scene.clock))
         pairs.add(view.frame.pixels8, light, mean.light, mean.known & view.valid)
-        made["mean"], made["mean_known"] = mean.light, mean.known
+        made["mean"], made["mean_known"], made["codes"] = mean.light, mean.known, view.frame.pixels8
         for phase in dict.fromkeys((*tfs, *ratio)):
-            tick = spike_tick(view, view.instant_ns(phase), clock)
-            found = textures_at(view.spikes, tick, config.textures, config.texture_window)
-            made["textures"][phase] = [straight.texture(t) for t in found]
+            make = partial(textures_at, kind=config.textures, window=config.texture_window)
+            made["textures"][phase] = light_at(view, phase, late, scene.clock, straight, make)
     return made
+
+
+def _finite(light: NDArray[np.float32], name: str, scene: SceneFile) -> NDArray[np.float32]:
+    """True light as it is, if all of it is finite (a file that was changed since it was written may hold anything)."""
+    bad = np.argwhere(~np.isfinite(light))
+    if len(bad):
+        raise NumericsError(
+            f"the true light of view '{name}' is not finite",
+            value=f"{light[tuple(bad[0])]} at index {bad[0].tolist()}, {len(bad)} in all",
+            expected="finite numbers",
+            cause="a damaged file",
+            next=f"spikerig data verify {scene.path}",
+        )
+    return light
 
 
 def _finish(
@@ -294,39 +270,47 @@ def _finish(
     number: int,
     config: FitConfig,
     gauge: Gauge,
-    gray: Gray | None,
+    seen: Gray | Filters | None,
     instants: tuple[tuple[float, ...], ...],
 ) -> TrainView:
     _, tfs, ratio = instants
     light, valid = torch.from_numpy(raw["light"]), raw["valid"]
-    clipped = light.clamp(0, 1)
+    clipped = light.clamp(0, None if config.highlights == "keep" else 1)  # a truth may be brighter than white
     made: dict[float, Instant] = {}
     for phase, pose in raw["pose"].items():
         textures, target = (), torch.zeros(0, dtype=torch.half)
-        if gray is not None and phase in raw["textures"]:
+        if seen is not None and phase in raw["textures"]:
             found = raw["textures"][phase]
             averaged = average_texture(found)
             if phase in tfs or (ratio and config.tfs_weight > 0):
                 each = [averaged] if config.tfs_combine == "average" else [(t.light, t.known) for t in found]
-                textures = tuple(_tfs_target(a, k & valid, gray.white, config) for a, k in each)
+                textures = tuple(_tfs_target(a, k & valid, seen.white, config) for a, k in each)
             if phase in ratio:
+                now = averaged[0] / np.float32(seen.white), averaged[1]
+                mean = raw["mean"] / np.float32(seen.white), raw["mean_known"]
+                if isinstance(seen, Filters):
+                    now, mean = seen.colours(*now), seen.colours(*mean)
                 target = ratio_target(
                     clipped,
-                    torch.from_numpy(averaged[0] / np.float32(gray.white)),
-                    torch.from_numpy(raw["mean"] / np.float32(gray.white)),
-                    torch.from_numpy(averaged[1] & raw["mean_known"]),
+                    torch.from_numpy(now[0]),
+                    torch.from_numpy(mean[0]),
+                    torch.from_numpy(now[1] & mean[1]),
                     eps=config.ratio_eps,
                     low=config.ratio_min,
                     high=config.ratio_max,
                 ).half()
-        made[phase] = Instant(torch.from_numpy(gauge.pose(pose)), textures, target)
+        poses = gauge.pose(pose) if pose.ndim == 2 else np.stack([gauge.pose(each) for each in pose])
+        made[phase] = Instant(torch.from_numpy(poses), textures, target)
     everywhere = None if valid.all() else torch.from_numpy(valid)
     which = torch.tensor([number])
-    return TrainView(raw["name"], srgb_from_linear(clipped).contiguous(), everywhere, made, None, which, raw["beside"])
+    late = None if raw["late"] is None else torch.from_numpy(raw["late"])
+    frame = srgb_from_linear(clipped).contiguous()
+    beside = raw["beside"] | ({"site": torch.from_numpy(seen.site)} if isinstance(seen, Filters) else {})
+    return TrainView(raw["name"], frame, everywhere, made, None, which, beside, late)
 
 
 def _tfs_target(
-    light: NDArray, known: NDArray[np.bool_], white: float, config: FitConfig
+    light: NDArray, known: NDArray[np.bool_], white: float | NDArray[np.float32], config: FitConfig
 ) -> tuple[torch.Tensor, torch.Tensor]:
     texture = torch.from_numpy(np.ascontiguousarray(light / np.float32(white), np.float32))
     if config.highlights == "clip":

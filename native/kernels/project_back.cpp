@@ -14,11 +14,11 @@ struct Incoming {  // d loss / d: log opacity, p, r, s (in units of the power it
   V3 from_centre;  // mean - camera centre, through the SH direction
 };
 
-// A splat's slots, added in tile order, in double; false when all are empty.
-bool gather(const Frame &f, int64_t i, double *sum) {
+// A splat's slots, added in tile order, in double; false when all are empty. The last two: those of absgrad, if asked.
+bool gather(const Frame &f, int64_t i, bool absgrad, double *sum) {
   const Rect r = f.rects.data[i];
   vd low[8 / WIDE] = {};
-  double last_sum = 0;
+  double last_sum = 0, absolute[2] = {};
   bool some = false;
   size_t slot = f.first_slot.data[i];
   const size_t last = slot + static_cast<size_t>(r.x1 - r.x0) * (r.y1 - r.y0);
@@ -28,9 +28,10 @@ bool gather(const Frame &f, int64_t i, double *sum) {
     const float *from = f.slots.data + slot * SLOT;
     for (int k = 0; k < 8; ++k) low[k / WIDE][k % WIDE] += from[k];
     last_sum += from[8];
+    if (absgrad) absolute[0] += from[9], absolute[1] += from[10];
   }
   __builtin_memcpy(sum, low, sizeof low);
-  sum[8] = last_sum;
+  sum[8] = last_sum, sum[9] = absolute[0], sum[10] = absolute[1];
   return some;
 }
 
@@ -63,6 +64,7 @@ void zero(const SplatGrads &out, int64_t i, int sh_rows) {
   for (int k = 0; k < 3 * sh_rows; ++k) out.sh[3 * sh_rows * i + k] = 0;
   out.logits[i] = 0;
   out.means2d[2 * i] = out.means2d[2 * i + 1] = 0;
+  if (out.absgrad) out.absgrad[2 * i] = out.absgrad[2 * i + 1] = 0;
 }
 
 // p = sqrt(c22 / det), r = -c12 / sqrt(c22 det), s = 1 / sqrt(c22) back to the rows a and b.
@@ -144,11 +146,11 @@ void project_back(Frame &f, const SplatGrads &grads, int64_t begin, int64_t end,
   for (int64_t first = begin; first < end; first += WIDE) {
     vl some{};
     bool any_at_all = false;
-    double sums[9][WIDE] = {}, toward[3][WIDE] = {}, factor[3][WIDE] = {};
+    double sums[6][WIDE] = {}, toward[3][WIDE] = {}, factor[3][WIDE] = {};
     for (int l = 0; l < WIDE && first + l < end; ++l) {
       const int64_t i = first + l;
-      double m[9], t[3];
-      if (f.rects.data[i].x0 == f.rects.data[i].x1 || !gather(f, i, m)) {
+      double m[11], t[3];
+      if (f.rects.data[i].x0 == f.rects.data[i].x1 || !gather(f, i, grads.absgrad != nullptr, m)) {
         zero(grads, i, sh_rows);
         continue;
       }
@@ -158,6 +160,9 @@ void project_back(Frame &f, const SplatGrads &grads, int64_t begin, int64_t end,
       for (int k = 0; k < 6; ++k) sums[k][l] = m[k];
       for (int k = 0; k < 3; ++k) toward[k][l] = t[k];
       factor[0][l] = p.p, factor[1][l] = p.r, factor[2][l] = p.s;
+      if (!grads.absgrad) continue;
+      grads.absgrad[2 * i] = static_cast<float>(2 * LN2 * p.p * m[9]);
+      grads.absgrad[2 * i + 1] = static_cast<float>(2 * LN2 * m[10]);
     }
     if (!any_at_all) continue;
     // log alpha = log opacity - ln 2 (u^2 + v^2), and the sums hold d, d u, d dy, d u dx, d u dy, d dy^2

@@ -136,10 +136,13 @@ void raster_tile(Frame &f, int tile) {
   });
 }
 
+namespace {
+
 // Back to front: the light T is undone by 1 / (1 - alpha) >= 1, which is at most 100, and S, the loss's share of all
 // that lies behind, grows from small to large. So both keep their relative accuracy however deep the stack.
 // d(loss)/d(alpha) = T <colour, gradient> - S / (1 - alpha).
-void raster_tile_back(Frame &f, int tile) {
+template <bool ABSGRAD>
+void tile_back(Frame &f, int tile) {
   alignas(64) vf light[BLOCKS], behind[BLOCKS], red[BLOCKS], green[BLOCKS], blue[BLOCKS];
   alignas(64) vi finished[BLOCKS];
   const Offsets at = offsets();
@@ -168,7 +171,7 @@ void raster_tile_back(Frame &f, int tile) {
     if (!todo) continue;
     const Footprint &s = f.footprints.data[list[k].splat];
     const float x = static_cast<float>(s.x - c.x), y = static_cast<float>(s.y - c.y);
-    vf sum[9] = {};
+    vf sum[ABSGRAD ? 11 : 9] = {};
     for (; todo; todo &= todo - 1) {
       const int b = __builtin_ctzll(todo);
       const vf dx = at.x + (4 * (b % 4) - x), dy = at.y + (TALL * (b / 4) - y);
@@ -192,10 +195,26 @@ void raster_tile_back(Frame &f, int tile) {
       sum[3] += du * dx;
       sum[4] += du * dy;
       sum[5] += dv * dy;
+      if constexpr (ABSGRAD) {  // d loss / d centre of this pixel alone, up to 2 ln 2 (and p)
+        const vf along = s.r * du + s.s * s.s * dv;
+        sum[9] += larger(du, -du);
+        sum[10] += larger(along, -along);
+      }
     }
-    sum_nine(sum, f.slots.data + static_cast<size_t>(list[k].slot) * SLOT);
+    float *slot = f.slots.data + static_cast<size_t>(list[k].slot) * SLOT;
+    sum_nine(sum, slot);
+    if constexpr (ABSGRAD) slot[9] = sum_lanes(sum[9]), slot[10] = sum_lanes(sum[10]);
     f.used.data[list[k].slot] = 1;
   }
+}
+
+}  // namespace
+
+void raster_tile_back(Frame &f, int tile, bool absgrad) {
+  if (absgrad)
+    tile_back<true>(f, tile);
+  else
+    tile_back<false>(f, tile);
 }
 
 }  // namespace spikerig::SPIKERIG_ISA

@@ -37,7 +37,7 @@ def take_view(spec: SceneSpec, number: int, stage: Stage | None = None) -> Taken
     rig, times, path = rig_of(spec), schedule(timed(spec, number, stage)), view_path(spec, number)
     label = path.poses(times.label)[0]
     sharp = stage.picture(rig.camera, label, spec.lens.samples)
-    phases, name = track_phases(times), f"{number:03d}"
+    phases, name = track_phases(times, _readout(spec)), f"{number:03d}"
     track = Track(phases, path.poses(phases))
     held_out = spec.orbit.held_out()
     if number in held_out:
@@ -51,6 +51,12 @@ def take_view(spec: SceneSpec, number: int, stage: Stage | None = None) -> Taken
     share = share_of(spec.cloud.count, train.index(number), len(train))
     depth = stage.depth(rig.camera, label)
     return replace(taken, points=surface(rig, number, spec.cloud, share, taken.view, depth))
+
+
+def _readout(spec: SceneSpec) -> float:
+    """Of a rolling shutter, in exposures; 0 without."""
+    rolling: Any = next((e for e in spec.effects if e.name == "rolling_shutter"), None)
+    return 0.0 if rolling is None else rolling.readout_ms / spec.exposure.exposure_ms
 
 
 def _first(pictures: NDArray[np.float32] | None) -> NDArray[np.float32] | None:

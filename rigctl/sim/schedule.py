@@ -34,10 +34,16 @@ class Track:
     poses: NDArray[np.float64]
 
 
-def track_phases(plan: Schedule) -> NDArray[np.float64]:
-    """Phases of a track's poses: the ends of the exposure, the pictures within it, and the label."""
-    within = plan.phases[(plan.phases >= 0) & (plan.phases <= 1)]
-    return np.unique(np.concatenate([[0.0], within, [plan.label, 1.0]]))
+def track_phases(plan: Schedule, readout: float = 0.0) -> NDArray[np.float64]:
+    """Phases of a track's poses: the ends of the exposure, the pictures within it, and the label.
+
+    Args:
+        plan: of the view.
+        readout: of a rolling shutter, in exposures: half of it is added on either side, for the rows read there.
+    """
+    ends = np.array([-readout / 2, 0.0, 1.0, 1 + readout / 2])
+    within = plan.phases[(plan.phases >= ends[0]) & (plan.phases <= ends[-1])]
+    return np.unique(np.concatenate([ends, within, [plan.label]]))
 
 
 def schedule(exposure: Exposure) -> Schedule:

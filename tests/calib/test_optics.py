@@ -11,7 +11,7 @@ from spikerig.calib.bundle import Sight
 from spikerig.calib.crop import parallax_px, rgb_px_from_spike_px, spike_px_from_rgb_px
 from spikerig.calib.measure import measure, report
 from spikerig.calib.mono import fit_lens
-from spikerig.calib.optics import fit_rig
+from spikerig.calib.optics import fit_arms
 from spikerig.calib.verdict import coverage, repeats
 from spikerig.dataset.errors import NumericsError
 
@@ -22,7 +22,7 @@ VIEWS = 8
 @pytest.mark.parametrize("shift", [(0, 0, 0), (15.0, -2.0, 3.0)])
 def test_a_rig_is_found_whatever_its_mirror_and_labels(mirrored: str | None, shift: tuple[float, float, float]) -> None:
     true = rig(shift, mirrored)
-    fit = fit_rig(BOARD, *corners_seen(true, VIEWS, shuffle=True), lenses=(4,))
+    fit = fit_arms(BOARD, *corners_seen(true, VIEWS, shuffle=True), lenses=(4,))
     found = fit.calibration
     assert found.mirrored == mirrored
     assert found.model == true.model
@@ -36,16 +36,16 @@ def test_a_rig_is_found_whatever_its_mirror_and_labels(mirrored: str | None, shi
 
 
 def test_the_same_corners_give_the_same_record() -> None:
-    assert len({fit_rig(BOARD, *corners_seen(rig(), 5), lenses=(4,)).calibration.id for _ in range(5)}) == 1
+    assert len({fit_arms(BOARD, *corners_seen(rig(), 5), lenses=(4,)).calibration.id for _ in range(5)}) == 1
 
 
 def test_the_user_may_say_that_the_spike_arm_is_the_mirrored_one() -> None:
     true = rig((0, 0, 0), "spike")
     sights = corners_seen(true, VIEWS, shuffle=True)
-    told = fit_rig(BOARD, *sights, mirror="spike", lenses=(4,)).calibration
+    told = fit_arms(BOARD, *sights, mirror="spike", lenses=(4,)).calibration
     assert told.mirrored == "spike"
     assert crop_error_px(told, true) < 0.15
-    guessed = fit_rig(BOARD, *sights, lenses=(4,)).calibration  # a checkerboard cannot tell which arm it is
+    guessed = fit_arms(BOARD, *sights, lenses=(4,)).calibration  # a checkerboard cannot tell which arm it is
     assert guessed.mirrored == "rgb"
     assert crop_error_px(guessed, true) < 0.15
 
@@ -58,21 +58,21 @@ def test_square_patterns_are_labelled_in_four_ways() -> None:
     first, second = (dataclasses.replace(s, px=s.px[:, some], seen=s.seen[:, some]) for s in corners_seen(true, VIEWS))
     for v in range(VIEWS):
         second.px[v] = square.relabelled(second.px[v], v % 4)
-    fit = fit_rig(square, first, second, lenses=(4,))
+    fit = fit_arms(square, first, second, lenses=(4,))
     assert fit.match.agree.all()
     assert fit.calibration.baseline_mm == pytest.approx(5, abs=0.2)
 
 
 def test_one_centre_is_given_up_for_parallax_and_only_for_it() -> None:
-    kept = [fit_rig(BOARD, *corners_seen(rig(), VIEWS, noise_seed=k), lenses=(4,)) for k in range(4)]
+    kept = [fit_arms(BOARD, *corners_seen(rig(), VIEWS, noise_seed=k), lenses=(4,)) for k in range(4)]
     assert [f.calibration.model for f in kept] == ["common"] * 4
     assert all(f.calibration.baseline_mm == 0 for f in kept)
     true = rig((1.0, 0, 0))  # a splitter 1 mm off: 0.4 px over the depths seen
-    fit = fit_rig(BOARD, *corners_seen(true, VIEWS), lenses=(4,))
+    fit = fit_arms(BOARD, *corners_seen(true, VIEWS), lenses=(4,))
     assert fit.calibration.model == "stereo"
     assert fit.chance < 1e-3
     assert fit.parallax_px == pytest.approx(parallax_px(true), rel=0.3)
-    assert fit_rig(BOARD, *corners_seen(true, VIEWS), model="common", lenses=(4,)).calibration.model == "common"
+    assert fit_arms(BOARD, *corners_seen(true, VIEWS), model="common", lenses=(4,)).calibration.model == "common"
 
 
 def test_lens_coefficients_are_those_that_foretell_unseen_views() -> None:
@@ -100,7 +100,7 @@ def test_no_view_in_common_is_said() -> None:
     first, second = (dataclasses.replace(s, seen=s.seen & side) for s, side in (
         (first, np.arange(6)[:, None] < 3), (second, np.arange(6)[:, None] >= 3)))  # fmt: skip
     with pytest.raises(NumericsError, match="both arms"):
-        fit_rig(BOARD, first, second, lenses=(0,))
+        fit_arms(BOARD, first, second, lenses=(0,))
 
 
 def codes(sights: tuple[Sight, Sight], **changes: object) -> list[str]:

@@ -127,6 +127,23 @@ def test_frames_tell_the_panels_time():
     assert {s.row > 135 for s in sights} == {False, True}
 
 
+@pytest.mark.parametrize("last", [0.3, 0.6, 1.5])
+def test_an_led_that_comes_on_as_the_clip_ends_makes_no_false_time(last):
+    # Too few of its frames show what it is when on: a share of that would be off by milliseconds.
+    panel, exposure = Panel(bits=16, slow=7), 8_000_000
+    places = worlds.spots(panel, 480, 270, 3.1)
+    (number,) = [k for k, led in enumerate(panel.leds) if led.bit == 13 and not led.inverted]
+    toggles = panel.edges(BASE, BASE + 20 * NS, [number])
+    begins = round((int(toggles.at_ns[toggles.rising][0]) - BASE) / (1 + 30e-6))
+    step = NS / 119.88
+    starts = begins + np.rint((np.arange(51) - 50 + last) * step).astype(np.int64)
+    looks = worlds.frames_of(panel, places, starts, exposure, 10_000.0, ahead, noise=0.005)
+    sights = read_frames(looks, panel, places, 10_000.0, ahead_ns=BASE)
+    error, _ = off(sights)
+    assert len(sights) > 20
+    assert np.abs(error).max() < 200_000
+
+
 def test_a_wrong_response_and_a_wrong_readout_are_solved_for():
     panel, places, looks = shot(gamma=0.8, row_ns=ROW_NS * 1.05)
     sights = read_frames(looks, panel, places, ROW_NS, ahead_ns=BASE)

@@ -13,7 +13,7 @@ from spikerig.calib.bundle import Sight, turn
 from spikerig.calib.lens import our_matrix, project
 from spikerig.calib.measure import measure, report
 from spikerig.calib.mono import fit_lens
-from spikerig.calib.optics import fit_rig, sight_of
+from spikerig.calib.optics import fit_arms, sight_of
 from spikerig.calib.parity import inverse, times
 from spikerig.calib.verdict import Seen
 from spikerig.dataset.images import linear_from_srgb, read_image
@@ -83,7 +83,7 @@ def test_mrcals_corners_give_mrcals_rig(shared_data: Callable[[str], Path]) -> N
             px.setdefault(name, []).append([float(x) + 0.5, float(y) + 0.5])
     arms = [np.array([px[f"frame{k:06d}-cam{arm}.xxx"] for k in range(3)]) for arm in (0, 1)]
     sights = [Sight(a, np.ones(a.shape[:2], bool), 4000, 2200) for a in arms]
-    fit = fit_rig(Board(10, 10, 100.0), *sights, lenses=(8,))
+    fit = fit_arms(Board(10, 10, 100.0), *sights, lenses=(8,))
     models = [ast.literal_eval((folder / f"cam{arm}.opencv8.cameramodel").read_text()) for arm in (0, 1)]
     cams = [np.concatenate([turn(np.array(m["extrinsics"][:3])), np.reshape(m["extrinsics"][3:], (3, 1))], 1)
             for m in models]  # fmt: skip

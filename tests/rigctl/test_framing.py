@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 from framing_scenes import wire_bytes
-from vidar_bench import K20, MID, SMALL, S, camera
+from vidar_bench import K20, MID, SMALL
 
 from spikerig.dataset.errors import DataError, UsageError
-from spikerig.dataset.framing import Watch, find_phase, fold, period_gain, rates_at, row_lag
+from spikerig.dataset.framing import find_phase, fold, period_gain, rates_at, row_lag
 from spikerig.rigctl.profiles import PROFILES
-from spikerig.rigctl.sim.emulate.spikewire import Ticks
-from spikerig.rigctl.vidar import VidarSource
 
 K416 = PROFILES["vidar-400x250-20k-416"]
 M1 = PROFILES["m1k40-1000x1000-20k"]
@@ -88,42 +86,3 @@ def test_the_rates_of_a_tick_are_means_of_its_bits():
         fold(data[: 15 * SMALL.tick_bytes], SMALL.tick_bytes)
     with pytest.raises(UsageError, match="another size"):
         find_phase(data, SMALL, np.zeros(3))
-
-
-def test_too_small_a_loss_for_the_time_is_seen_by_the_watch():
-    lost = 12  # bytes: 0.05 us at 250 MB/s
-    data = wire_bytes(K20, "object", 256)
-
-    def bits(t0, t1):
-        rows = data.reshape(256, 250, 50)[np.arange(t0, t1) % 256]
-        return np.ascontiguousarray(rows[:, ::-1])
-
-    host, bus, bridge = camera(K20, Ticks(bits, K20), faults=[{"kind": "drop", "at_s": 0.25, "bytes": lost}])
-    source = VidarSource(K20, host, bus)
-    source.start()
-    watch, slips, epochs = Watch(K20, every_bytes=10_000_000), [], set()
-    while host.now_ns() < S // 2:
-        block = source.read(S)
-        epochs.add(block.epoch)
-        slips += [s for s in [watch.add(block.epoch, block.byte_index, block.data)] if s]
-    assert epochs == {0}  # the time told nothing
-    (slip,) = slips
-    assert slip.shift == K20.tick_bytes - lost
-    assert slip.confidence > 0.999
-    assert [x["stop"] - x["start"] for x in bridge.truth(0)["lost"] if x["why"] == "drop"] == [lost]
-    assert slip.after < 0.25 * K20.bytes_s < slip.before + 5_000_000
-    source.close()
-
-
-def test_the_watch_is_silent_on_a_whole_stream_and_on_noise():
-    for data in (wire_bytes(MID, "texture", 400), noise(MID, 400)):
-        watch = Watch(MID, every_bytes=0)
-        step = 50_004
-        told = [watch.add(0, at, data[at : at + step]) for at in range(0, len(data) - step, step)]
-        assert told == [None] * len(told)
-    watch = Watch(M1, every_bytes=0, ticks=16)
-    data = wire_bytes(M1, "texture", 40)
-    assert watch.add(0, 0, data[64 : 64 + 20 * 128_000]) is None
-    slip = watch.add(0, 20 * 128_000, data[64 + 20 * 128_000 - 128_000 + 640 :])
-    assert slip.shift == 128_000 - 640
-    assert watch.add(1, 0, data[192:]) is None  # a new epoch has no past

@@ -3,7 +3,7 @@
 import http.client
 
 import pytest
-from gopro_cameras import S, camera, record, web_to
+from gopro_cameras import S, camera, record, rig, wait, web_to
 
 from spikerig.dataset.errors import DeviceError, HostError, UsageError
 from spikerig.rigctl.gopro_http import Dark, Media, Web, Wifi
@@ -181,6 +181,29 @@ def test_downloads_that_cannot_be(tmp_path):
         web.download(media, tmp_path / "c.MP4")
     with pytest.raises(HostError, match="cannot be written"):
         web.download(media, tmp_path / "none" / "d.MP4")
+
+
+@pytest.mark.parametrize(("faults", "breaks"), [({}, False), ({"downloads_break": (2000, *[0] * 20)}, True)])
+def test_turbo_is_on_while_it_downloads_and_off_whatever_came_of_it(tmp_path, faults, breaks):
+    source, cam = rig(tmp_path, **faults)
+    source.start()
+    wait(source, 2)
+    clip = source.stop()
+    during, get = [], source.web.download
+
+    def download(*of):
+        cam.advance()
+        during.append(cam.turbo)
+        return get(*of)
+
+    source.web.download = download
+    if breaks:
+        with pytest.raises(DeviceError, match="breaks off"):
+            source.fetch(clip, tmp_path)
+    else:
+        source.fetch(clip, tmp_path)
+    assert during == [True]
+    assert not cam.turbo
 
 
 def test_over_a_real_socket(tmp_path):

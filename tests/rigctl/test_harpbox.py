@@ -1,8 +1,10 @@
 """The emulated box itself, by the firmware's published behaviour."""
 
 import numpy as np
+import pytest
 from harp_rigs import S, box_on, rig
 
+from spikerig.dataset.errors import DataError
 from spikerig.rigctl import harp
 from spikerig.rigctl.harp import Decoder, Message, encode
 from spikerig.rigctl.sim.emulate.latency import Latency
@@ -79,3 +81,17 @@ def test_three_seconds_without_a_listener_is_standby():
     port = wire.port()
     host.sleep_until(host.now_ns() + 3 * S)
     assert port.in_waiting == 0
+
+
+@pytest.mark.parametrize("start_second", [77, harp.ROLL_S - 3])
+def test_the_sync_packet_of_each_second_tells_the_boxs_time(start_second):
+    host, wire = rig(start_second=start_second)
+    packets = wire.sync_out(host.now_ns(), host.now_ns() + 6 * S)
+    assert len(packets) == 6
+    for at, packet in packets:
+        told = harp.parse_sync(packet)
+        true = int(wire.box_ns(at))
+        assert abs(harp.unwrapped_ns(told.at_ns, true) - true) <= 1
+        assert harp.parse_sync(packet).second == -(-true // S) % harp.ROLL_S
+    with pytest.raises(DataError):
+        harp.parse_sync(packets[0][1][1:] + packets[1][1][:1])  # cut at the wrong byte

@@ -13,16 +13,20 @@ from framing_scenes import wire_bytes
 from spikerig.calib.panel_read import Spot
 from spikerig.dataset.cli import run
 from spikerig.dataset.errors import DataError, RefusedError, UsageError
+from spikerig.dataset.framing import Phase
 from spikerig.dataset.kernels import count
+from spikerig.dataset.marks import Sight, read_marks
 from spikerig.dataset.rawtake import WireBytes, open_take, read_lines, verify_take
 from spikerig.dataset.segments import Chunk, scan
 from spikerig.dataset.store import open_scene, verify_scene
+from spikerig.rigctl import ingest_times
 from spikerig.rigctl.ingest import IngestConfig, ingest
-from spikerig.rigctl.ingest_sights import panel_pairs, sights
-from spikerig.rigctl.ingest_slips import MendedBytes, find_slips
+from spikerig.rigctl.ingest_sights import panel_in_view, panel_pairs, sights
+from spikerig.rigctl.ingest_slips import MendedBytes
 from spikerig.rigctl.ingest_times import Framing, Times, clip_number, read_truth
 from spikerig.rigctl.ingest_truth import TrueWorld
 from spikerig.rigctl.profiles import PROFILES
+from spikerig.rigctl.slips import find_slips
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +52,17 @@ def test_ticks_begin_where_the_camera_began_them(taken: Path) -> None:
     told = open_take(taken)
     framing = Framing(WireBytes(told), [s for v in told.views() for s in v.spikes])
     assert framing.offset(0) == -first_byte(taken) % 384
+
+
+def test_viewpoints_tell_together_what_none_tells_alone(taken: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ingest_times, "find_phase", lambda *_: Phase(7, 0.5, "seam"))
+    told = open_take(taken)
+    spans = [s for v in told.views() for s in v.spikes]
+    assert Framing(WireBytes(told), spans).offset(0) == -first_byte(taken) % 384
+    noise = np.random.default_rng(3).integers(0, 256, 3 * 512 * 384, dtype=np.uint8)
+    wire = SimpleNamespace(take=told, read=lambda epoch, start, stop: (noise[start:stop], []))
+    with pytest.raises(RefusedError, match="where ticks begin"):
+        Framing(wire, [(0, k * 512 * 384, (k + 1) * 512 * 384) for k in range(3)]).offset(0)  # type: ignore[arg-type]
 
 
 def test_a_scene_right_in_time_and_place(taken: Path, tmp_path: Path) -> None:
@@ -115,7 +130,8 @@ def test_several_frames_a_viewpoint_and_own_choices(taken: Path, tmp_path: Path)
 
 
 def test_a_damaged_chunk_becomes_lost_ticks(folder: Path, tmp_path: Path) -> None:
-    whole = ingest(folder, tmp_path / "whole.h5")
+    wide = IngestConfig(margin_ticks=600)  # the frame in the hole says nothing: another is taken, and reaches over it
+    whole = ingest(folder, tmp_path / "whole.h5", wide)
     assert whole["lost_ticks"] == 0
     with open_scene(tmp_path / "whole.h5") as file:
         before = file.read()
@@ -128,7 +144,7 @@ def test_a_damaged_chunk_becomes_lost_ticks(folder: Path, tmp_path: Path) -> Non
     data[hit.offset + 5] ^= 1
     hit.path.write_bytes(data)
     assert run(["data", "ingest", str(folder), "-o", str(tmp_path / "told.h5")]) == 1
-    told = ingest(folder, tmp_path / "s.h5")
+    told = ingest(folder, tmp_path / "s.h5", wide)
     assert told["lost_ticks"] > 100
     with open_scene(tmp_path / "s.h5") as file:
         scene = file.read()
@@ -139,9 +155,30 @@ def test_a_damaged_chunk_becomes_lost_ticks(folder: Path, tmp_path: Path) -> Non
     for a, b in spikes.lost:
         lost[a:b] = True
     assert not spikes.bits[lost].any()
-    assert np.array_equal(spikes.bits[~lost], good.bits[~lost])
-    assert lost.any()
+    by = round((spikes.t0_ns - good.t0_ns) * 20_000 / 1e9)  # ticks that it begins later
+    same = slice(max(by, 0), min(good.ticks, spikes.ticks + by))
+    bits, left = (x[same.start - by : same.stop - by] for x in (spikes.bits, ~lost))
+    assert left.sum() > 200
+    assert np.array_equal(bits[left], good.bits[same][left])
     assert len(scene.view("002").spikes.lost) == 0
+
+
+def test_a_view_whose_every_tick_is_lost_is_left_out_and_told(folder: Path, tmp_path: Path) -> None:
+    _, start, stop = open_take(folder).views()[1].spikes[0]
+    for path in sorted((folder / "spikes").glob("*.seg")):
+        data = bytearray(path.read_bytes())
+        for c in scan(path):
+            if isinstance(c, Chunk) and start < c.head.byte_index + c.head.payload and c.head.byte_index < stop:
+                data[c.offset + 4096 + 7] ^= 1  # the payload does not match its digest any more
+        path.write_bytes(data)
+    told = ingest(folder, tmp_path / "s.h5", IngestConfig(frames=2, test_every=0))
+    assert list(told["left_out"]) == ["001"]
+    assert "every tick of its exposures is lost" in told["left_out"]["001"]
+    assert told["views"] == 4
+    with open_scene(tmp_path / "s.h5") as file:
+        scene = file.read()
+    assert [v.name for v in scene.views] == ["000-0", "000-1", "002-0", "002-1"]
+    assert run(["data", "ingest", str(folder), "-o", str(tmp_path / "again.h5")]) == 1
 
 
 def test_what_cannot_be_cut_is_left_out_and_told(folder: Path, tmp_path: Path) -> None:
@@ -205,6 +242,10 @@ def test_the_panel_ties_frames_and_spikes_without_any_truth(tmp_path: Path) -> N
     assert told["sigma_us"] < 300
     with open_scene(tmp_path / "s.h5") as file:
         scene = file.read()
+    assert run(["rig", "panel", str(folder)]) == 0  # the same code, where the plan has the panel
+    marks = [m for m in read_marks(folder / "marks.jsonl") if isinstance(m, Sight)]
+    assert len(marks) == told["sights"]
+    assert ingest(folder, tmp_path / "again.h5")["sigma_us"] == told["sigma_us"]  # sights that are there count once
     times = Times(raw, truth)
     clips = {v.name: clip_number(v.clips[0]) for v in raw.views()}
     for view in scene.views:
@@ -220,7 +261,8 @@ def test_a_loss_that_time_cannot_see_becomes_lost_ticks(taken: Path, tmp_path: P
     view = open_take(taken).views()[1]
     calm_s = (view.clip["start_ns"][1] + 75_000_000) / 1e9 - 1000.0  # within its spikes
     folder = tmp_path / "take"
-    take(folder, plan_of(test_every=3), spike={"faults": [{"kind": "drop", "at_s": calm_s, "bytes": lost}]})
+    plan = plan_of(test_every=3, recorder={"watch": False})  # else it is taken again: test_record_slips.py
+    take(folder, plan, spike={"faults": [{"kind": "drop", "at_s": calm_s, "bytes": lost}]})
     assert verify_take(folder)[0] == []  # time told nothing
     (hole,) = [x for x in json.loads((folder / "truth.json").read_text())[0]["spike"][0]["lost"] if x["why"] == "drop"]
     told = ingest(folder, tmp_path / "s.h5")
@@ -264,7 +306,9 @@ def test_frames_of_a_long_shutter_are_timed_as_well_as_is_claimed(tmp_path: Path
     wire = WireBytes(raw)
     times = Times(raw, truth)
     framing = Framing(wire, [s for v in raw.views() for s in v.spikes], panel_pairs(raw))
-    times.fit(sights(raw, raw.views(), times.clocks, wire, framing)[0])
+    panel = panel_in_view(raw.plan)
+    assert panel is not None
+    times.fit(sights(raw, raw.views(), panel, times.marks, wire, framing)[0])
     off, claimed = [], []
     for clip in (r for r in truth[0]["rgb"] if r["event"] == "clip"):
         media, true = np.array(clip["media_ns"]), np.array(clip["true_ns"])
@@ -288,7 +332,7 @@ def test_a_loss_of_whole_rows_is_told_where_the_picture_has_edges(kind: str, los
     def read(epoch: int, start: int, stop: int) -> tuple[np.ndarray, list[tuple[int, int]]]:
         return came[start:stop], [] if stop <= len(came) else [(len(came), stop)]
 
-    wire = SimpleNamespace(take=SimpleNamespace(profile=profile), read=read)
+    wire = SimpleNamespace(profile=profile, read=read)
     found = find_slips(wire, [(0, 0, len(came))])  # type: ignore[arg-type]
     assert [s.lost for s in found] == [lost] * sure
     assert all(s.after <= cut <= s.before for s in found)

@@ -1,6 +1,7 @@
 """From a take's bytes and clips, by the panel in them, to both cameras in rig time: against the oscillators."""
 
 import json
+import shutil
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -15,9 +16,11 @@ from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.images import srgb8_from_linear
 from spikerig.dataset.marks import MarkLog, Sight, read_marks
 from spikerig.dataset.panel import Panel
+from spikerig.dataset.rawtake import WireBytes, open_take
 from spikerig.dataset.segments import STAMP, ChunkHead, encode_head, padded
 from spikerig.dataset.wire import WireProfile
 from spikerig.rigctl import panel_take
+from spikerig.rigctl.ingest_sights import found_in
 from spikerig.rigctl.panel_take import read_spots
 from spikerig.rigctl.sim.emulate.clockworld import HIGH_SPEED, World
 from spikerig.rigctl.sim.emulate.gopro_mp4 import Recording, write_clip
@@ -73,15 +76,43 @@ def taken(tmp_path_factory):
     return world, folder, shot
 
 
+class Known:  # where ticks begin is found elsewhere, from pictures with more in them than LEDs
+    def __init__(self, *_):
+        pass
+
+    def offset(self, epoch):
+        return OFFSET
+
+
+def test_a_panel_is_found_by_its_blinking(taken, monkeypatch, tmp_path):
+    told = json.loads((taken[1].parent / "spots.json").read_text())
+    folder = shutil.copytree(taken[1], tmp_path / "take")
+    (tmp_path / "find.json").write_text(json.dumps(told | {"spike": "find", "rgb": "find"}))
+    monkeypatch.setattr(panel_take, "Framing", Known)
+    take = open_take(folder)
+    view = read_spots(tmp_path / "find.json")
+    assert view.find == ("spike", "rgb")
+    found = found_in(take, take.views(), view, WireBytes(take), Known())
+    for got, true in ((found.spike, SPIKE), (found.rgb, RGB)):
+        by_led = {s.led: s for s in got}
+        assert sorted(by_led) == list(range(2 * PANEL.bits))  # those that are always on tell no time
+        off = [np.hypot(by_led[s.led].x_px - s.x_px, by_led[s.led].y_px - s.y_px) for s in true if s.led in by_led]
+        assert max(off) < 0.6
+        assert got[0].radius_px == pytest.approx(true[0].radius_px, abs=0.7)
+    told = panel_take.read_panel(folder, view, force=True)
+    assert told["trouble"] == []
+    assert told["spike"] > 30
+    assert told["rgb"] > 50
+    short = replace(view, panel=Panel(bits=4, slow=2))
+    with pytest.raises(DataError, match="so short a look"):
+        found_in(take, take.views(), short, WireBytes(take), Known())
+    other = replace(view, panel=Panel(step_ns=83_000, bits=15, slow=6))
+    with pytest.raises(DataError, match="blink"):
+        found_in(take, take.views(), other, WireBytes(take), Known())
+
+
 def test_a_takes_panel_ties_both_cameras_to_the_rig(taken, monkeypatch, capsys):
     world, folder, shot = taken
-
-    class Known:  # where ticks begin is found elsewhere, from pictures with more in them than LEDs
-        def __init__(self, *_):
-            pass
-
-        def offset(self, epoch):
-            return OFFSET
 
     monkeypatch.setattr(panel_take, "Framing", Known)
     assert run(["rig", "panel", str(folder), str(folder.parent / "spots.json"), "--json"]) == 0

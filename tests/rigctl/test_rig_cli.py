@@ -9,7 +9,7 @@ from vidar_bench import K20
 
 from spikerig.dataset import cli
 from spikerig.dataset.rawtake import open_take
-from spikerig.rigctl import rig_cli, usbport
+from spikerig.rigctl import open_rig, rig_cli, usbport
 from spikerig.rigctl.probe import examine
 from spikerig.rigctl.profiles import PROFILES
 
@@ -182,3 +182,14 @@ def test_find_probe_and_record_read_the_same_rig(tmp_path, capsys):
         code, doc = told(capsys, "rig", *words, "--emulate", str(rig))
         assert code == 2
         assert "serail" in json.dumps(doc)
+
+
+def test_a_plan_beyond_the_link_is_refused_before_any_device_is_touched(tmp_path, capsys, monkeypatch):
+    plan, folder = tmp_path / "plan.toml", tmp_path / "take"
+    plan.write_text('name = "fast"\nviewpoints = 40\nseconds = 1.0\n[spike]\nprofile = "vidar-400x250-40k-416"\n')
+    monkeypatch.setattr(open_rig, "open_rig", lambda *_: pytest.fail("a device was touched"))
+    for words in (["-o", str(folder)], ["-o", str(folder), "--emulate", "demo"]):
+        code, doc = told(capsys, "rig", "record", str(plan), *words)
+        assert (code, folder.exists()) == (2, False)
+        assert "520 MB/s" in doc["error"]["value"]
+        assert "360 MB/s" in json.dumps(doc["error"])

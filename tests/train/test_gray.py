@@ -6,6 +6,8 @@ import pytest
 from spikerig.dataset.errors import DataError
 from spikerig.dataset.images import linear_from_srgb
 from spikerig.train.gray import Pairs, solve
+from spikerig.train.methods import configure
+from spikerig.train.run import run_fit
 
 TRUE = np.array([0.25, 0.40, 0.35])
 
@@ -73,3 +75,23 @@ def test_a_black_scene_and_foreign_spikes_are_told():
     pairs.add(codes, light, 1 - light @ TRUE, np.ones((40, 40), bool))
     with pytest.raises(DataError, match="do not grow"):
         solve(pairs, "calibrated", None)
+
+
+@pytest.mark.parametrize("kind", ["constrained", "response"])
+def test_held_converters_train_keep_their_sum_and_are_told_in_the_record(tiny, tmp_path, kind):
+    done = run_fit(
+        tiny,
+        configure("spikenerf", "draft", steps=60, splats=300, gray=kind, lr_gray=0.05),
+        tmp_path / kind,
+        eval_every=0,
+    )
+    gray = done["learned_gray"]
+    assert sum(gray[:3]) == pytest.approx(1.0, abs=1e-5)
+    assert min(gray[:3]) > 0
+    assert gray != pytest.approx([0.299, 0.587, 0.114, 0.0], abs=1e-3)
+    curve = done["learned_response"]
+    if kind == "constrained":
+        assert curve is None
+    else:
+        assert curve == sorted(curve)
+        assert (curve[0], curve[-1]) == pytest.approx((0, 1), abs=1e-5)

@@ -20,7 +20,8 @@ def row(kernel: str) -> dict:
 def measured(monkeypatch: pytest.MonkeyPatch) -> None:
     spikes = [row(k) for k in ("unpack", "count", "tfi_at", "tfi_all")]
     spikes.append(row("fire") | {"ticks_per_second": 7e4, "ns_per_pixel_tick": 0.14})
-    splats = [row("raster") | {"consulted_per_pixel": 320.0, "splat_pixels_per_second": 7e8}, row("ssim")]
+    raster = row("raster") | {"absgrad_seconds": 0.042, "consulted_per_pixel": 320.0, "splat_pixels_per_second": 7e8}
+    splats = [raster, row("ssim")]
     monkeypatch.setattr(spike_bench, "rows", lambda quick: spikes)
     monkeypatch.setattr(train_bench, "rows", lambda quick: splats)
 
@@ -39,4 +40,4 @@ def test_table_tells_what_is_special_to_a_kernel(capsys: pytest.CaptureFixture[s
     out = capsys.readouterr().out
     assert "raster              40.000" in out
     assert "70000 ticks/s, 0.14 ns a pixel and tick" in out
-    assert "320 splats consulted a pixel, 700 M splat-pixels/s" in out
+    assert "320 splats consulted a pixel, 700 M splat-pixels/s, with absgrad 42.00 ms" in out

@@ -44,6 +44,36 @@ def test_the_fast_field_learns(tiny, tmp_path):
     assert done["psnr"] > history[0]["psnr"] + 3
 
 
+def test_points_put_the_fast_field_where_the_scene_is(tiny):
+    """Taught points, it begins darker off them, solid on them, and coloured as they are; random starts know nothing."""
+    from spikerig.train.hashed import density_of
+
+    config = small("nerf-fast", finest=128, table_log2=13, grid_levels=8)
+    with open_scene(tiny) as scene:
+        points, (task, _) = scene.points, prepare(scene, tiny, config)
+        assert points is not None
+        taught, bare = (new_state(points, replace(task, config=c)) for c in (config, replace(config, init="random")))
+    xyz = torch.from_numpy(task.gauge.inside(points.xyz).astype(np.float32))
+    anywhere = torch.from_numpy(np.random.default_rng(0).uniform(-1, 1, (2000, 3)).astype(np.float32))
+    on, off = (density_of(taught.params, config, x)[0].median().item() for x in (xyz, anywhere))
+    assert on > 20 * off
+    assert density_of(bare.params, config, xyz)[0].median().item() == pytest.approx(1, rel=0.2)
+    assert taught.grids["occupancy"].unique().tolist() == pytest.approx([0.6, 90.0])
+    assert bare.grids["occupancy"].unique().tolist() == [1.0]
+
+
+def test_points_outside_the_box_teach_nothing(tiny):
+    from spikerig.train.hashed import start_hashed
+    from spikerig.train.prime import prime
+
+    config = small("nerf-fast")
+    params, grids = start_hashed(config)
+    prime(params, grids, np.full((5, 3), 7.0), np.zeros((5, 3)), config)
+    fresh, _ = start_hashed(config)
+    assert all(torch.equal(params[name], fresh[name]) for name in fresh)
+    assert torch.all(grids["occupancy"] == 1)
+
+
 def test_the_papers_field_learns(tiny):
     losses = fitted(tiny, small("nerf", "oracle", steps=80, rays=64, width=32, lr_net=2e-3))[1]
     assert np.mean(losses[-20:]) < 0.6 * np.mean(losses[:5])

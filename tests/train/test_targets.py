@@ -15,7 +15,8 @@ from spikerig.dataset.texture import Texture
 from spikerig.train.gauge import Gauge
 from spikerig.train.methods import configure
 from spikerig.train.metrics import psnr
-from spikerig.train.targets import Targets, average_texture, load_targets, spike_tick, windowed_tfi
+from spikerig.train.spikelight import average_texture, spike_tick, windowed_tfi
+from spikerig.train.targets import Targets, load_targets
 
 UNIT = Gauge((0.0, 0.0, 0.0), 1.0)
 
@@ -33,14 +34,6 @@ def changed(tiny, tmp_path, **changes):
     views = (replace(scene.views[0], **changes), *scene.views[1:]) if changes else scene.views
     write_scene(tmp_path / "changed.h5", replace(scene, views=views, **of_scene))
     return tmp_path / "changed.h5"
-
-
-def test_a_scene_of_a_colour_spike_camera_is_refused_where_gray_is_compared(tiny, tmp_path):
-    path = changed(tiny, tmp_path, info={"sensor": {"bayer": "rggb"}})
-    for method in ("spikenerf", "spike-ratio"):
-        with pytest.raises(DataError, match="see colours"):
-            targets(path, method)
-    targets(path, "oracle")
 
 
 def test_the_calibrated_converter_is_that_of_the_simulator(tiny):
@@ -147,7 +140,7 @@ def test_no_trajectory_no_truth_no_training_views(tiny, tmp_path):
     with pytest.raises(DataError, match="sharp truth"):
         targets(path, "oracle")
     held_out = tuple(v for v in scene.views if v.split == "test")
-    write_scene(path, replace(scene, truth=None, views=held_out), force=True)
+    write_scene(path, replace(scene, truth=None, events={}, views=held_out), force=True)
     with pytest.raises(DataError, match="no training views"):
         targets(path, "plain")
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.dataset.errors import HostError
+from spikerig.dataset.pyav import pyav
 from spikerig.rigctl.sim.arms import in_views
 from spikerig.rigctl.sim.effects import Hooks, Site, Stage
 from spikerig.rigctl.sim.effects.jpeg import coding_loss
@@ -56,7 +56,7 @@ class VideoCodec:
         Raises:
             HostError: PyAV is not installed.
         """
-        _av()
+        pyav()
         return Hooks(coded=self.through)
 
     def bits_for(self, pixels: NDArray[Any]) -> float:
@@ -92,14 +92,6 @@ class VideoCodec:
         return Bound(0.0, coding_loss(facts, self.through), words)
 
 
-def _av() -> Any:
-    try:
-        import av
-    except ImportError as error:
-        raise HostError("video needs PyAV", next="pip install 'spikerig[video]'") from error
-    return av
-
-
 def _softened(pixels: NDArray[Any]) -> NDArray[Any]:
     wide = np.pad(pixels.astype(np.float32), [(1, 1), (1, 1), (0, 0)], mode="edge")
     rows = SOFTEN[0] * wide[:-2] + SOFTEN[1] * wide[1:-1] + SOFTEN[2] * wide[2:]
@@ -115,7 +107,7 @@ def _padded(pixels: NDArray[Any]) -> NDArray[Any]:
 
 def _coded(codec: str, pair: tuple[NDArray[Any], NDArray[Any]], qp: int) -> tuple[NDArray[Any], list[int]]:
     """The second of two pictures after coding with a quantiser, and the bytes of both."""
-    av = _av()
+    av = pyav()
     deep = pair[0].dtype == np.uint16
     kind, inside = ("rgb48le", "yuv420p10le") if deep else ("rgb24", "yuv420p")
     encoder = av.CodecContext.create("libx264" if codec == "h264" else "libx265", "w")

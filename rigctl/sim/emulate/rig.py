@@ -12,14 +12,16 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from spikerig.calib.panel_read import Spot
 from spikerig.dataset.clocktime import NS
 from spikerig.dataset.errors import UsageError
+from spikerig.dataset.panel import Led, Panel
 from spikerig.dataset.wire import WireProfile
 from spikerig.rigctl.gopro import GoProSource
 from spikerig.rigctl.gopro_http import Web
 from spikerig.rigctl.gopro_radio import Radio
+from spikerig.rigctl.led_view import LedPlan, led_mask
 from spikerig.rigctl.panel_view import PanelPlan, centres, mask
-from spikerig.rigctl.record import Rig
 from spikerig.rigctl.sim.emulate.gopro_air import Air
 from spikerig.rigctl.sim.emulate.gopro_camera import Faults as RgbFaults
 from spikerig.rigctl.sim.emulate.gopro_camera import GoProCamera, Nature
@@ -28,14 +30,17 @@ from spikerig.rigctl.sim.emulate.harpbox import BoxFaults, HarpBoxWire
 from spikerig.rigctl.sim.emulate.latency import Latency
 from spikerig.rigctl.sim.emulate.oscillator import Oscillator
 from spikerig.rigctl.sim.emulate.panel_light import PanelInView
+from spikerig.rigctl.sim.emulate.sensors import Sensors, effects_of
 from spikerig.rigctl.sim.emulate.serialport import device_errors
 from spikerig.rigctl.sim.emulate.spike_bench import bridge_of
+from spikerig.rigctl.sim.emulate.spikewire import SpikeWire
 from spikerig.rigctl.sim.emulate.usb import EmulatedUsb
 from spikerig.rigctl.sim.emulate.virtual import VirtualHost
 from spikerig.rigctl.sim.emulate.world import PanelSeen, Ticker, world_of
 from spikerig.rigctl.sim.limits import Faults, limits, read_record
 from spikerig.rigctl.syncbox import HarpBox
 from spikerig.rigctl.take_plan import TakePlan
+from spikerig.rigctl.tally import Rig
 from spikerig.rigctl.vidar import VidarSource
 
 R = TypeVar("R")
@@ -54,6 +59,10 @@ class RigSpec:
         start_s: the host's clock at first.
         spike: table of `spike_bench.bridge_of`, without the profile: the plan names it.
         rgb: ppm and the like of its crystal; nature, faults: tables of `gopro_camera`.
+        effects: of optics and sensors, as a scene file lists them, or "scene": those of the scene. They cost what
+            docs/effects.md says; none unless asked for.
+        led: of a plan without a clock box: ppm and the like of the LED's crystal; period_ms, spike, rgb (x and y),
+            radius_px, where they are not the plan's.
         box: ppm and the like; firmware, start_second; to_box, to_host: tables of `Latency`; faults: of `BoxFaults`.
     """
 
@@ -63,6 +72,8 @@ class RigSpec:
     spike: Any = limits({})
     rgb: Any = limits({})
     box: Any = limits({})
+    led: Any = limits({})
+    effects: Any = limits(())
 
 
 def load_rig_spec(path: str | Path) -> RigSpec:
@@ -87,7 +98,7 @@ def load_rig_spec(path: str | Path) -> RigSpec:
         raise UsageError("the emulated rig's file is not valid TOML", value=f"{name}: {error}") from None
     faults = Faults(name, next="the keys are in docs/operator.md")
     spec = read_record(RigSpec, table, "", faults)
-    for key in ("spike", "rgb", "box"):
+    for key in ("spike", "rgb", "box", "led"):
         if not isinstance(getattr(spec, key), Mapping):
             faults.add(key, "is not a table")
     faults.raise_any()
@@ -112,9 +123,14 @@ def open_emulated(spec: RigSpec, plan: TakePlan, *, card: Path, after_ns: int = 
     wire = plan.profile
     size = (wire.width, wire.height)
     world = world_of(spec.scene, len(plan.viewpoints), size, wire.rate_hz, host, spec.seed or None)
+    if spec.effects:
+        effects = effects_of(spec.effects, world.spec, "the emulated rig's file")
+        world.sensors = Sensors(effects, world.camera, wire.rate_hz, spec.seed)
     box = _box(spec, host) if plan.sync.mode == "box" else None
     if box is not None and plan.panel is not None:
         world.panel = _panel(plan.panel, box, size)
+    if plan.sync.mode == "optical":
+        world.panel = _led(spec, plan.led or LedPlan(), size)
     ticker = Ticker(world, spec.seed)
     bridge = bridge_of({"seed": spec.seed, **spec.spike, "profile": _wire_table(wire)}, start_ns, ticker, "spike")
     ticker.tick_ns = bridge.wire.tick_true_ns
@@ -133,6 +149,7 @@ def open_emulated(spec: RigSpec, plan: TakePlan, *, card: Path, after_ns: int = 
             "world": {"scene": spec.scene, "views": len(plan.viewpoints), "seed": spec.seed, "moved": world.moved},
             "spike": list(usb.truth()),
             "rgb": [] if camera is None else camera.truth,
+            "spike_clock": _stream_clock(bridge.wire, start_ns, host.now_ns()),
             "box": None if box is None else {"events": box.truth, "clock": _knots(box, start_ns, host.now_ns())},
         }  # fmt: skip
 
@@ -208,6 +225,24 @@ def _panel(plan: PanelPlan, box: HarpBoxWire, size: tuple[int, int]) -> PanelSee
     return PanelSeen(spike, rgb, dark, box.box_ns)
 
 
+def _led(spec: RigSpec, plan: LedPlan, size: tuple[int, int]) -> PanelSeen:
+    """A plain blinking LED at the same place of both pictures, unless told otherwise; half of its period it is on."""
+    table = dict(spec.led)
+    period_ms = float(table.pop("period_ms", plan.period_ms or 400.0))
+    radius = float(table.pop("radius_px", plan.spike_radius_px))
+    places = {arm: table.pop(arm, getattr(plan, arm)) or (size[0] / 2, radius + 2) for arm in ("spike", "rgb")}
+    clock = _clock(table, spec.seed, "led", "led")
+    dark = np.zeros((size[1], size[0]), bool)
+    seen = []
+    for arm, light in (("spike", LED_SPIKES), ("rgb", LED_LIGHT)):
+        at = np.asarray(places[arm], np.float64).reshape(-1, 2)
+        leds = tuple(Led(0, False, float(x), float(y)) for x, y in at)
+        panel = Panel(round(period_ms * 1e6 / 2), 1, 0, leds)
+        seen.append(PanelInView(panel, at, radius, light, size[1], size[0]))
+        dark |= led_mask([Spot(0, x, y, radius) for x, y in at.tolist()], size[1], size[0])
+    return PanelSeen(seen[0], seen[1], dark, clock.device_from_true)
+
+
 def _camera(spec: RigSpec, host: VirtualHost, pictures: Any, card: Path) -> GoProCamera:
     table = dict(spec.rgb)
     nature = _of(Nature, table.pop("nature", {}), "rgb.nature")
@@ -249,6 +284,13 @@ def _tuples(value: Any) -> Any:
 
 def _wire_table(wire: Any) -> dict[str, Any]:
     return {f.name: getattr(wire, f.name) for f in fields(wire) if f.name != "sure"}
+
+
+def _stream_clock(wire: SpikeWire, start_ns: int, end_ns: int) -> list[list[int]]:
+    """True time, and the spike camera's own: bytes it has put out over their nominal rate, once a second."""
+    at = range(start_ns, end_ns + NS, NS)
+    profile = wire.profile
+    return [[t, round(wire.made(t) / profile.tick_bytes / profile.rate_hz * NS)] for t in at]
 
 
 def _knots(box: HarpBoxWire, start_ns: int, end_ns: int) -> list[list[int]]:

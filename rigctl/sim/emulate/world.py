@@ -6,6 +6,7 @@ from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from spikerig.rigctl.host import Host
 from spikerig.rigctl.sim.caster.light import Stage, stage_of
 from spikerig.rigctl.sim.draws import stream
 from spikerig.rigctl.sim.emulate.panel_light import PanelInView
+from spikerig.rigctl.sim.emulate.sensors import Sensors
 from spikerig.rigctl.sim.rgb import encode
 from spikerig.rigctl.sim.shake import ShakePath
 from spikerig.rigctl.sim.spec import SceneSpec, load_scene_toml, with_changes
@@ -56,7 +58,8 @@ class World:
     Args:
         spec: the scene; its camera is that of both arms.
         host: whose time is true time.
-        panel: the LED panel before both cameras; it stands still in their pictures.
+        panel: the LED panel (or the LED) before both cameras; it stands still in their pictures.
+        sensors: what both cameras' sensors and optics do to the light; None: nothing.
 
     Attributes:
         moved: (true time, viewpoint) of each time the rig was brought somewhere.
@@ -65,6 +68,7 @@ class World:
     spec: SceneSpec
     host: Host
     panel: PanelSeen | None = None
+    sensors: Sensors | None = None
     moved: list[tuple[int, int]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -119,7 +123,8 @@ class World:
         number = self.number_at(true_ns)
         if number not in self._gray:
             weights = np.asarray(self.spec.sensor.response, np.float32) * np.float32(self.spec.sensor.gain)
-            self._gray[number] = np.asarray(self.pictures(number) @ weights, np.float32)
+            gray = np.asarray(self.pictures(number) @ weights, np.float32)
+            self._gray[number] = gray if self.sensors is None else self.sensors.spike_light(gray)
             while len(self._gray) > KEPT:
                 self._gray.popitem(last=False)
         return _between(self._gray[number], float(self.phase_at(true_ns)))
@@ -142,7 +147,7 @@ class World:
             view, rows = self.panel.rgb, begin.astype(np.int64)
             on, off = self.panel.box_ns(rows), self.panel.box_ns(rows + exposure_ns)
             mean[view.rows, view.columns] += view.of_rows(on, off - on)[:, None]
-        return encode(mean)
+        return encode(mean) if self.sensors is None else self.sensors.picture(mean)
 
 
 class Ticker:
@@ -159,18 +164,22 @@ class Ticker:
         self.tick_ns: Callable[[int], int] = lambda tick: 0
         size = (world.camera.height, world.camera.width)
         self._account: Account = opened(stream(seed, "emulated charge").random(size))
-        self._panel_charge: NDArray[np.uint32] | None = None
+        self._panel_charge: NDArray[Any] | None = None
 
     def __call__(self, t0: int, t1: int) -> NDArray[np.uint8]:
         """Ticks [t0, t1), uint8[n,H,ceil(W/8)]; what was skipped since the last call was dark."""
         begin, end = self.tick_ns(t0), self.tick_ns(t1)
         count = max(1, round((end - begin) / GRID_NS))
         ticks = np.unique(np.rint(np.linspace(t0, t1, count + 1)).astype(int))
-        light = [(int(t - t0), self.world.thresholds(self.tick_ns(int(t)))) for t in ticks]
-        bits = np.concatenate(list(spike_blocks(light, self._account, hold=False, block_ticks=1 << 16)))
-        return bits if self.world.panel is None else self._with_panel(bits, self.world.panel, begin, end)
+        sensors = self.world.sensors
+        light = [(int(t), self.world.thresholds(self.tick_ns(int(t)))) for t in ticks]  # draws go by absolute ticks
+        pixel = sensors.pixel if sensors else None
+        bits = np.concatenate(list(spike_blocks(light, self._account, hold=False, block_ticks=1 << 16, pixel=pixel)))
+        if self.world.panel is not None:
+            bits = self._with_panel(bits, self.world.panel, t0, begin, end)
+        return bits if sensors is None else sensors.read(bits, self.world.camera.width)
 
-    def _with_panel(self, bits: NDArray[np.uint8], seen: PanelSeen, begin: int, end: int) -> NDArray[np.uint8]:
+    def _with_panel(self, bits: NDArray[np.uint8], seen: PanelSeen, t0: int, begin: int, end: int) -> NDArray[np.uint8]:
         """The LEDs' pixels fired anew under the black face's light and the panel's, exact within each tick."""
         view = seen.spike
         bounds = seen.box_ns(np.linspace(begin, end, len(bits) + 1).astype(np.int64))
@@ -179,11 +188,15 @@ class Ticker:
         count = len(view.rows)
         if self._panel_charge is None:
             self._panel_charge = stream(1, "panel charge").integers(0, 1 << 32, count, dtype=np.uint32)
-        fired, left, _ = fire(light[:, None, :], np.arange(len(light) + 1), self._panel_charge[None], hold=True)
-        self._panel_charge = left[0].astype(np.uint32)
+        if self.world.sensors is None:
+            told, left, _ = fire(light[:, None, :], np.arange(len(light) + 1), self._panel_charge[None], hold=True)
+            fired, self._panel_charge = told[:, 0], left[0].astype(np.uint32)
+        else:
+            felt = self.world.sensors.rows_of(view.rows, view.columns, light)
+            fired, self._panel_charge = self.world.sensors.fire_rows(felt, t0, self._panel_charge)
         rows, where = np.unique(view.rows, return_inverse=True)
         pixels = np.unpackbits(bits[:, rows], axis=2, bitorder="little")
-        pixels[:, where, view.columns] = np.unpackbits(fired[:, 0], axis=1, bitorder="little", count=count)
+        pixels[:, where, view.columns] = np.unpackbits(fired, axis=1, bitorder="little", count=count)
         bits[:, rows] = np.packbits(pixels, axis=2, bitorder="little")
         return bits
 

@@ -6,16 +6,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from types import ModuleType
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spikerig.dataset.errors import DataError, HostError, UsageError
+from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.exr import check_size
 from spikerig.dataset.images import linear_from_srgb
 from spikerig.dataset.primaries import REC709, rec709_from
+from spikerig.dataset.pyav import pyav
 from spikerig.rigctl.sim.limits import nearest
 
 D65 = (0.3127, 0.3290)
@@ -107,7 +107,7 @@ class Video:
         Raises:
             DataError: a frame is damaged, or the file breaks off.
         """
-        av = _av()
+        av = pyav()
         first: Fraction | None = None
         number, last = 0, Fraction(0)
         try:
@@ -182,7 +182,7 @@ def open_video(path: Path, transfer: str = "auto") -> Video:
     """
     if transfer not in ("auto", *NAMES):
         raise UsageError("no such transfer", value=transfer, expected=nearest(transfer, ("auto", *NAMES)))
-    av = _av()
+    av = pyav()
     file = path.open("rb")
     try:
         container = av.open(file, options={"protocol_whitelist": "pipe"})
@@ -227,14 +227,3 @@ def _curve(name: str, deep: bool) -> NDArray[np.float32]:
     if (name, deep) not in _CURVES:
         _CURVES[name, deep] = linear_from(name, np.linspace(0, 1, 65536 if deep else 256)).astype(np.float32)
     return _CURVES[name, deep]
-
-
-def _av() -> ModuleType:
-    try:
-        import av
-    except ImportError as error:
-        raise HostError(
-            "video files need PyAV, which is not installed", cause="the extra 'video' was left out",
-            next='pip install "spikerig[video]"',
-        ) from error  # fmt: skip
-    return av
