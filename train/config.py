@@ -206,7 +206,7 @@ class FitConfig:
     knots_at: str = "even"
     path_from: str = "given"
     anchor: str = "mean"
-    lr_poses: float = 5e-3
+    lr_poses: float = 2e-3
     lr_poses_end: float = 0.01
     pose_noise_deg: float = 0.0
     pose_noise_share: float = 0.0
