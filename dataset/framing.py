@@ -177,7 +177,7 @@ def find_shift(counts: Rates, like: Rates, sure: float = 0.999) -> int:
     """
     score = _alike(counts, like, 8)
     best = int(np.argmax(score))
-    return best if best and _confidence(score, best) > sure else 0
+    return best if best and confidence_of(score, best) > sure else 0
 
 
 def seam_scores(data: Bytes, profile: WireProfile) -> Rates:
@@ -241,7 +241,7 @@ def _alike(rates: Rates, like: Rates, pixels: int = 1) -> Rates:
 
 def _best(score: Rates, profile: WireProfile, how: str) -> Phase:
     best = int(np.argmax(score))
-    confidence = _confidence(score, best)
+    confidence = confidence_of(score, best)
     row = profile.row_bits // 8
     at = np.arange(len(score))
     apart = (at - best + row) % len(score)
@@ -250,7 +250,8 @@ def _best(score: Rates, profile: WireProfile, how: str) -> Phase:
     return Phase(best, confidence, how, rival)
 
 
-def _confidence(score: Rates, best: int) -> float:
+def confidence_of(score: Rates, best: int) -> float:
+    """How likely the best of some scores (ln of likelihood ratios) is right; low where none stands out."""
     odds = score - score[best]
     nothing = np.log(len(score)) + _NEED + float(np.median(odds))  # all candidates alike, and the wish for proof
     return float(1.0 / (np.exp(odds).sum() + np.exp(np.clip(nothing, -700, 700))))

@@ -16,7 +16,7 @@ from spikerig.calib.clock_maps import Clocks
 from spikerig.calib.panel_read import Spot
 from spikerig.dataset.clocktime import NS, ClockModel
 from spikerig.dataset.errors import DataError, RefusedError
-from spikerig.dataset.framing import find_phase
+from spikerig.dataset.framing import confidence_of, find_phase, seam_scores
 from spikerig.dataset.gopro_file import GoProClip
 from spikerig.dataset.marks import Sight, read_marks
 from spikerig.dataset.rawtake import RawTake, WireBytes, read_lines
@@ -200,14 +200,23 @@ class Framing:
                 yield start, data
 
     def _by_seam(self, epoch: int) -> int | None:
-        sure = set()
+        sure: set[int] = set()
+        size = self.profile.tick_bytes
+        total = np.zeros(size)
         for start, data in self._stretches(epoch):
-            phase = find_phase(data[: PHASE_TICKS * self.profile.tick_bytes], self.profile)
+            piece = data[: PHASE_TICKS * size]
+            phase = find_phase(piece, self.profile)
             if phase.confidence >= SURE:
-                sure.add((start + phase.offset) % self.profile.tick_bytes)
+                sure.add((start + phase.offset) % size)
             if len(sure) == 1 and phase.confidence > VERY_SURE:
                 break
-        return sure.pop() if len(sure) == 1 else None
+            if self.profile.framing == "none":
+                total += np.roll(seam_scores(piece, self.profile), start % size)
+        if sure:
+            return sure.pop() if len(sure) == 1 else None
+        # no picture tells by itself: what all of them say together, if it is said clearly
+        best = int(np.argmax(total))
+        return best if confidence_of(total, best) > VERY_SURE else None
 
     def _by_panel(self, epoch: int) -> int | None:
         total = np.zeros(self.profile.tick_bytes)

@@ -9,8 +9,8 @@ from spikerig.dataset.rawtake import read_lines
 from spikerig.dataset.terminal import note
 from spikerig.rigctl.devices import DeviceFacts
 from spikerig.rigctl.host import RealHost
-from spikerig.rigctl.record import Rig
 from spikerig.rigctl.take_plan import TakePlan
+from spikerig.rigctl.tally import Rig
 
 
 def open_rig(plan: TakePlan, take: Path, emulate: str = "", resume: bool = False) -> Rig:

@@ -18,7 +18,8 @@ from spikerig.rigctl.recorder import Recorder
 
 STEP_NS = NS // 20
 POLL_NS = NS
-KEPT = 120  # probes that the live residual looks at
+KEPT = 1000  # probes that the live residual looks at: a minute's
+GOLDEN_NS = 618_034  # of a millisecond: probes must not keep step with the bus's frames
 
 
 class Pulse:
@@ -93,19 +94,22 @@ class Pulse:
         with self.host.worker("pulse"):
             self._ready.set()
             next_probe = next_poll = self.host.now_ns()
+            asked = 0
             while not self._stop:
                 now = self.host.now_ns()
                 self._mark(list(self._stream_marks()))
                 if self.box is not None and now >= next_probe:
                     self._try("clock box", self._ask_box)
-                    next_probe = now + self.probe_ns
+                    asked += 1
+                    next_probe = now + self.probe_ns + asked * GOLDEN_NS % 1_000_000
                 if self.rgb is not None and now >= next_poll and self.rgb_free.acquire(blocking=False):
                     try:
                         self._try("rgb camera", self._poll)
                     finally:
                         self.rgb_free.release()
                     next_poll = now + POLL_NS
-                self.host.sleep_until(now + STEP_NS)
+                due = now + STEP_NS if self.box is None else min(now + STEP_NS, next_probe)
+                self.host.sleep_until(max(due, self.host.now_ns() + 1))
             self._mark(list(self._stream_marks()))
 
     def _try(self, what: str, step: Callable[[], None]) -> None:

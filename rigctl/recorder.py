@@ -15,11 +15,11 @@ from spikerig.dataset.segments import PAGE, ChunkHead, chunk_ticks, padded
 from spikerig.rigctl.devices import Block, SpikeSource
 from spikerig.rigctl.drain import Drain
 from spikerig.rigctl.host import Host
+from spikerig.rigctl.looks import Looks
 from spikerig.rigctl.numbering import FRAMING, Numbering
 from spikerig.rigctl.recorder_options import RecorderOptions, RecorderState
 from spikerig.rigctl.ring import Ring, Slot, ring_slots
 from spikerig.rigctl.segment_writer import SegmentWriter
-from spikerig.rigctl.slip_watch import SURE, Refound, Slip, SlipWatch
 from spikerig.rigctl.stream_notes import Glimpse, Progress
 
 TIMEOUT_NS = 100_000_000  # of one read
@@ -74,16 +74,18 @@ class Recorder:
         )
         self.ring = Ring(self.payload, slots)
         self._event = event
+        self._numbering = Numbering(first_epoch)
+        self._looks = Looks(
+            profile, self.ring, self.options.on_full == "wait", self._numbering, self._count_lost, self._tell
+        )  # fmt: skip
         writer = SegmentWriter(
             folder, host, lambda kind, words: self._tell(kind, words=words), segment_bytes=self.options.segment_bytes,
             sync_s=self.options.sync_s, direct=self.options.direct,
         )  # fmt: skip
         self._drain = Drain(
             self.ring, writer, take, first, self.tick_bytes, acknowledged, self._give_up, self._fail,
-            self._watched if self.options.watch else None,
+            self._looks.look if self.options.watch else None,
         )  # fmt: skip
-        self._numbering = Numbering(first_epoch)
-        self._watch = SlipWatch(profile)
         self._progress = Progress(self.tick_bytes / 1e9 * profile.rate_hz)
         self._lock = threading.Lock()
         self._want = False  # what keep() and pause() ask for
@@ -91,7 +93,6 @@ class Recorder:
         self._trouble = ""
         self._stop = False
         self._slot: Slot | None = None
-        self._idle: Slot | None = None  # of bytes that are looked at and not kept
         self._pending = Slot(memoryview(b""), np.zeros(0, np.uint8))  # losses that the next chunk will tell
         self._epoch, self._next = -1, 0  # the byte expected next
         self._seen = self._kept = self._lost_transport = self._lost_recorder = 0
@@ -209,7 +210,7 @@ class Recorder:
                 if not self._want:
                     self._end()
             self._end()
-            self._looked()
+            self._looks.flush()
 
     def _nothing(self) -> None:
         if not self._silent and self.host.now_ns() - self._last_ns > SILENT_NS:
@@ -230,44 +231,26 @@ class Recorder:
                 self._glimpse.show(block)
         if self._want and not self._keeping and not self._trouble:
             skip = min(-at % self.tick_bytes, len(data))
-            self._pending.skipped += skip
-            self._look(data[:skip], at)
+            self._pass_by(data[:skip], at)
             data, at = data[skip:], at + skip
             if len(data):
-                self._looked()
+                self._looks.flush()
                 self._keeping = True
                 self._spans.append([self._epoch, at, at])
         if self._keeping:
             self._keep(data, at, block)
         else:
-            self._pending.skipped += len(data)
-            self._look(data, at)
+            self._pass_by(data, at)
 
-    def _look(self, data: NDArray[np.uint8], at: int) -> None:
-        """Bytes that are not kept go to the watch all the same, as long as the disk has little to do."""
-        while self.options.watch and len(data):
-            if self._idle is None:
-                wait = self.options.on_full == "wait"
-                slot = self.ring.take(wait) if wait or self.ring.fill <= 1 else None
-                if slot is None:
-                    return
-                slot.wanted, slot.epoch, slot.byte_index, self._idle = False, self._epoch, at, slot
-            slot = self._idle
-            n = min(len(data), self.payload - slot.used)
-            slot.room[slot.used : slot.used + n] = data[:n]
-            slot.used += n
-            data, at = data[n:], at + n
-            if slot.used == self.payload:
-                self._looked()
-
-    def _looked(self) -> None:
-        slot, self._idle = self._idle, None
-        if slot is not None:
-            self.ring.give(slot)
+    def _pass_by(self, data: NDArray[np.uint8], at: int) -> None:
+        """Bytes that are not kept."""
+        self._pending.skipped += len(data)
+        if self.options.watch:
+            self._looks.pass_by(data, self._epoch, at)
 
     def _new_epoch(self, block: Block) -> None:
         self._hand_over()
-        self._looked()
+        self._looks.flush()
         first, lost = self._epoch < 0, block.lost_bytes
         if block.epoch == self._epoch and block.byte_index > self._next:
             lost = max(lost, block.byte_index - self._next)  # the driver skipped bytes and did not say so
@@ -307,13 +290,8 @@ class Recorder:
         slot = self.ring.take(wait=self.options.on_full == "wait")
         if slot is None:
             return None
-        told = self._pending
-        slot.epoch, slot.byte_index = self._epoch, at
-        slot.lost_transport, slot.lost_recorder = told.lost_transport, told.lost_recorder
-        slot.skipped, slot.suspect, slot.why = told.skipped, told.suspect, told.why
-        told.lost_transport = told.lost_recorder = told.skipped = told.suspect = 0
-        told.why = ""
-        self._slot = slot
+        slot.epoch, slot.byte_index, self._slot = self._epoch, at, slot
+        slot.tell(self._pending)
         return slot
 
     def _hand_over(self) -> None:
@@ -341,20 +319,6 @@ class Recorder:
         if self._keeping or self._slot is not None:
             self._hand_over()
             self._keeping = False
-
-    def _watched(self, slot: Slot) -> None:
-        """In the writing thread, with each buffer in turn."""
-        found = self._watch.add(slot.epoch, slot.byte_index, slot.room[: slot.used])
-        if isinstance(found, Refound):
-            sure = found.confidence > SURE
-            words = f"ticks begin {found.shift} bytes later" if sure else "where ticks begin could not be told"
-            self._tell("framing", epoch=found.epoch, shift=found.shift, confidence=found.confidence,
-                       words=f"after the loss, {words} (confidence {found.confidence:.3f})")  # fmt: skip
-        elif isinstance(found, Slip) and self._numbering.slip(found):
-            self._count_lost(found.lost)
-            self._tell("transport", epoch=found.epoch, byte_index=found.after, lost_bytes=found.lost,
-                       suspect_bytes=found.before - found.after, shift=found.shift, confidence=found.confidence,
-                       words=f"lost on the link: framing: ticks begin {found.shift} bytes later")  # fmt: skip
 
     def _count_lost(self, lost: int) -> None:
         with self._lock:

@@ -37,6 +37,13 @@ class Slot:
     why: str = ""
     wanted: bool = True
 
+    def tell(self, pending: Slot) -> None:
+        """Take over what was lost before this buffer; nothing is pending any more."""
+        self.lost_transport, self.lost_recorder = pending.lost_transport, pending.lost_recorder
+        self.skipped, self.suspect, self.why = pending.skipped, pending.suspect, pending.why
+        pending.lost_transport = pending.lost_recorder = pending.skipped = pending.suspect = 0
+        pending.why = ""
+
 
 class Ring:
     """Buffers that go round: free, filling, full, and free again.

@@ -17,7 +17,7 @@ MARGIN = LOOK_TICKS // 2  # ticks that `narrow` needs on either side of a look
 TAGS_S = 0.05  # between two looks at tags
 KEPT = 160  # ticks that are kept of what came: a look with its margins, and edges before it
 STEP = 128  # ticks between looks where something seems to have moved
-TESTS, EARNED = 4.0, 1 / 64  # full tests at hand at most, and earned by each look, of ticks of
+TESTS, EARNED = 4.0, 1 / 16  # full tests at hand at most, and earned by each look, of ticks of
 COSTLY = 12_500  # bytes; smaller ones cost less
 
 
@@ -102,7 +102,7 @@ class SlipWatch:
         looks again every 6.4 ms in between, and only where two such looks differ, too, comes the test that ingest
         makes (`slips.narrow`, `slips.settled`): the shift must come at once, within 3 ms, and one of whole rows only
         where the picture's edges moved as well. So a moving picture is no loss, and what is told here is what ingest
-        would find. Those tests are rationed (one in 64 looks, 4 in a row, more of smaller pictures; shifts by whole
+        would find. Those tests are rationed (one in 16 looks, 4 in a row, more of smaller pictures; shifts by whole
         rows, as a picture that moves makes them, and others apart), or a rig that is carried about would cost a whole
         core; what was not tested is counted, and ingest finds it. After a slip nothing is told until the next epoch.
         Whole ticks that are lost move nothing.

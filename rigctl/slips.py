@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from spikerig.dataset.framing import FEWEST, find_phase, rates_at, seam_scores
+from spikerig.dataset.framing import FEWEST, byte_counts, find_phase, find_shift, rates_at, seam_scores
 from spikerig.dataset.wire import WireProfile
 
 LOOK_TICKS, EVERY_TICKS = 32, 128  # of a look, and between two
@@ -18,6 +18,7 @@ SEAM_TICKS = 256  # of a stretch whose edges are looked at
 LEAST_GAIN = 8.0  # nats by which the edges must have moved
 MOST_STRETCHES = 16  # on each side
 SURE = 0.999
+MOST_TRIED = 3  # places
 
 Spans = Sequence[tuple[int, int, int]]
 
@@ -101,22 +102,42 @@ def shift_between(wire: Stream, epoch: int, first: int, second: int) -> int:
 
 
 def narrow(wire: Stream, epoch: int, first: int, second: int) -> tuple[Missing, int] | None:
-    """The loss between two looks and its shift, by halves; None where the shift comes bit by bit: a moving picture."""
+    """The loss between two looks and its shift; None where the shift comes bit by bit: a moving picture.
+
+    Args:
+        wire: of the stream; it holds half a look more on either side.
+        epoch: of the stream.
+        first, second: bytes where the looks begin.
+    """
+    if wire.profile.framing == "m1k40":
+        return _halved(wire, epoch, first, second)
+    size, row = wire.profile.tick_bytes, wire.profile.row_bits // 8
+    room = LOOK_TICKS * size
+    begin, end = max(first - room // 2, 0), second + 3 * room // 2
+    data, gone = wire.read(epoch, begin, end)
+    if gone:
+        return None
+    half = [byte_counts(data[at : at + room // 2], size) for at in range(0, len(data) - room // 2 + 1, room // 2)]
+    looks = [a + b for a, b in pairwise(half)]
+    # two looks with one between them: a look in the loss itself would see both framings
+    found = [(k, shift) for k in range(len(looks) - 4) if (shift := find_shift(looks[k + 4], looks[k], SURE))]
+    found.sort(key=lambda one: not 1 < one[1] % row < row - 1)  # first what is not by whole rows, as motion is
+    for k, _ in found[:MOST_TRIED]:
+        at = begin + k * room // 2
+        if shift := shift_between(wire, epoch, at, at + 2 * room):
+            return Missing(epoch, at + room // 2, at + 5 * room // 2, size - shift), shift
+    return None
+
+
+def _halved(wire: Stream, epoch: int, first: int, second: int) -> tuple[Missing, int] | None:
+    """The same by halves, where tags say where ticks begin and motion does nothing."""
     size = wire.profile.tick_bytes
     room = LOOK_TICKS * size
-    whole = shift_between(wire, epoch, first, second)
     while second - first > room:
         mid = first + (second - first) // (2 * size) * size
-        # a picture that moves shifts in both halves, the loss in one: that one is more like the whole
-        off = [abs((shift_between(wire, epoch, *half) - whole + size // 2) % size - size // 2)
-               for half in ((first, mid), (mid, second))]  # fmt: skip
-        first, second = (first, mid) if off[0] <= off[1] else (mid, second)
-    # a look in the loss itself sees both framings: the ones on either side of it see one each
-    first, second = first - room // 2 // size * size, second + room // 2 // size * size
-    shift = shift_between(wire, epoch, max(first, 0), second)
-    if not shift:
-        return None
-    return Missing(epoch, max(first, 0) + room // 2 // size * size, second + room, size - shift), shift
+        first, second = (first, mid) if shift_between(wire, epoch, first, mid) else (mid, second)
+    shift = shift_between(wire, epoch, max(first - room // 2, 0), second + room // 2)
+    return (Missing(epoch, first, second + 3 * room // 2, size - shift), shift) if shift else None
 
 
 def settled(wire: Stream, slip: Missing, spans: Spans, shift: int) -> Missing | None:

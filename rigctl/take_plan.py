@@ -69,12 +69,13 @@ class Sync:
         mode: "box": a Harp clock box with the LED panel in both views; "optical": any plain blinking LED in both views
             (`[led]`), for the time between the two cameras alone; "none": nothing: frames and spikes are not paired.
         port: of the box; empty: the only one there is.
-        probe_s: seconds between two questions to the box.
+        probe_s: seconds between two questions to the box; 16 a second are what a minute of hold-over within 100 us
+            needs (docs/clock.md).
     """
 
     mode: str = limits("box", choices=("box", "optical", "none"))
     port: str = limits("")
-    probe_s: float = limits(0.5, 0.01, 60, "s")
+    probe_s: float = limits(0.06, 0.01, 60, "s")
 
 
 @dataclass(frozen=True, slots=True)

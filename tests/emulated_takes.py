@@ -10,10 +10,11 @@ from spikerig.rigctl.ingest_slips import mended
 from spikerig.rigctl.ingest_times import Framing, Times, read_truth
 from spikerig.rigctl.led_view import led_plan
 from spikerig.rigctl.operator import Nobody
-from spikerig.rigctl.record import Rig, Tally, record
+from spikerig.rigctl.record import record
 from spikerig.rigctl.sim.emulate.rig import RigSpec, open_emulated
 from spikerig.rigctl.sim.limits import Faults, read_record
 from spikerig.rigctl.take_plan import TakePlan, read_plan
+from spikerig.rigctl.tally import Rig, Tally
 
 WIRE = {"name": "tiny", "width": 64, "height": 48, "row_bits": 64, "rate_hz": 20_000, "link_bytes_s": 3.6e8,
         "packet_bytes": 16384}  # fmt: skip

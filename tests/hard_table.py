@@ -66,9 +66,9 @@ ROWS = [
         CLAIMS + "reach_is_linear_between_looks_and_censored_beyond",
     ),
     (
-        "a censored cost below the claimed share",
+        "a censored cost",
         "claims",
-        "does not hold",
+        "not settled below the claimed share, else does not hold",
         CLAIMS + "a_cost_that_is_censored_never_holds_however_little_was_spent",
     ),
     (

@@ -31,6 +31,8 @@ ROWS = [
     ("logits of 1e4", "converter", "positive weights of the same sum, a monotone curve, finite gradients", "numerics/test_converter.py::test_held_converters_keep_their_sum_and_curves_their_order"),
     ("a weight of 0 or below", "start_converter", "finite, and its gradient leads up", "numerics/test_converter.py::test_a_weight_of_nothing_can_still_grow"),
     ("on either side of a knot, and on it", "respond", "the gradient of finite differences; one of its sides", "numerics/test_converter.py::test_gradients_are_those_of_finite_differences_on_both_sides_of_a_knot"),
+    ("filters that leak into each other", "solve_filters", "found to 0.2 %", "train/test_filters.py::test_filters_that_leak_are_found"),
+    ("settings that need gray, gray spikes alone", "load_targets", "UsageError, DataError", "train/test_filters.py::test_what_does_not_go_with_colour_spikes_is_refused"),
     ("pixels that never fire, pixels not valid", "load_targets", "no weight", TARGETS + "unknown_and_invalid_pixels_carry_no_weight"),
     ("spikes on a clock without a map", "spike_tick", "DataError", TARGETS + "spikes_on_another_clock_are_mapped_or_refused"),
     ("no spikes", "load_targets", "DataError for spike methods, plain runs", TARGETS + "what_a_method_lacks_is_told"),

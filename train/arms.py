@@ -11,14 +11,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch.nn.functional import grid_sample
 
 from spikerig.dataset.errors import DataError
 from spikerig.train.gray import BRIGHTEST, DARKEST
 
-ROUNDS = 6  # Gauss-Newton steps; two are enough for a pixel, more for several
+ROUNDS = 4  # Gauss-Newton steps; two are enough for a pixel, more for several
 BORDER = 8  # pixels at the edge that are left out
 MOST_PX = 12.0  # a larger motion is not what is left after a calibration
 
@@ -107,17 +105,39 @@ def motion_of(
 
 
 def moved(picture: NDArray, matrix: NDArray[np.float64]) -> NDArray[np.float32]:
-    """A picture [H,W,C] of the frames' camera on the pixels of the spikes'; bicubic, the border goes on outside."""
+    """A picture [H,W,C] of the frames' camera on the pixels of the spikes'; the border goes on outside.
+
+    Source: cubic convolution, Keys 1981, a = -1/2 (exact for slopes; -3/4, which torch has, shifts them).
+    """
     if not matrix.any():
         return np.asarray(picture, np.float32)
     height, width = picture.shape[:2]
-    one, x, y = _base(height, width)
-    to = np.stack([row[0] * one + row[1] * x + row[2] * y for row in matrix], -1)
-    px = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1) + to
-    grid = torch.from_numpy((px / [width, height] * 2 - 1).astype(np.float32))[None]
-    light = torch.from_numpy(np.array(picture, np.float32)).permute(2, 0, 1)[None]
-    out = grid_sample(light, grid, mode="bicubic", padding_mode="border", align_corners=False)
-    return out[0].permute(1, 2, 0).contiguous().numpy()
+    source = sources(height, width, matrix) - 0.5
+    whole = np.floor(source)
+    taps = [_keys(axis) for axis in np.moveaxis(source - whole, -1, 0)]
+    x, y = np.moveaxis(whole.astype(np.int64), -1, 0)
+    out = np.zeros(picture.shape)
+    for j, down in enumerate(taps[1]):
+        row = np.clip(y + j - 1, 0, height - 1)
+        for i, across in enumerate(taps[0]):
+            out += (down * across)[..., None] * picture[row, np.clip(x + i - 1, 0, width - 1)]
+    return out.astype(np.float32)
+
+
+def _keys(f: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    square, cube = f * f, f * f * f
+    return (
+        square - (f + cube) / 2,
+        1 - 2.5 * square + 1.5 * cube,
+        2 * square + f / 2 - 1.5 * cube,
+        (cube - square) / 2,
+    )
+
+
+def sources(height: int, width: int, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where in the frames the spikes' pixels are [H,W,2], pixels, centres at halves."""
+    here = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
+    return here + np.moveaxis(np.tensordot(matrix, _base(height, width), 1), 0, -1)
 
 
 def _base(height: int, width: int) -> NDArray[np.float64]:
@@ -131,9 +151,12 @@ def align(raw: list[dict[str, Any]], weights: NDArray, white: float, kind: str) 
         v["valid"] & v["mean_known"] & (v["codes"] >= DARKEST).all(-1) & (v["codes"] <= BRIGHTEST).all(-1) for v in raw
     ]
     found = motion_of([v["light"] for v in raw], [v["mean"] / white for v in raw], masks, weights, kind)
+    height, width = masks[0].shape
+    source = sources(height, width, found.matrix)
+    inside = ((source >= 0.5) & (source <= np.array([width, height]) - 0.5)).all(-1)
     for view in raw:
-        inside = moved(np.ones((*view["valid"].shape, 1), np.float32) * view["valid"][..., None], found.matrix)
+        seen = moved(view["valid"][..., None].astype(np.float32), found.matrix)[..., 0] > 0.999
         view["light"] = moved(view["light"], found.matrix).clip(0, 1)
         view["codes"] = np.rint(moved(view["codes"].astype(np.float32), found.matrix).clip(0, 255)).astype(np.uint8)
-        view["valid"] = view["valid"] & (inside[..., 0] > 0.999)
+        view["valid"] = view["valid"] & seen & inside
     return found

@@ -50,6 +50,12 @@ class Bridge:
         }
 
 
+def estimated_poses(scene: SceneFile) -> bool:
+    """Whether a scene's poses are estimates (of `calib poses` or COLMAP); those of a transforms.json are given."""
+    record = scene.info.get("poses")
+    return record is not None and not (isinstance(record, str) and record.endswith(".json"))
+
+
 def stored_cameras(scene: SceneFile) -> dict[str, Floats]:
     """Mid-exposure poses [3,4] of a scene's training views, as stored: what a fit of it is given."""
     return {name: scene.view(name, spikes=False).pose.cam_from_world for name in scene.train}

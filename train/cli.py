@@ -20,7 +20,8 @@ def fit(
     method: Annotated[
         str,
         typer.Option(help="Loss and camera model: plain, average, spikenerf, spikenerf-5x, spike-ratio, "
-                     "spike-hybrid, oracle; baselines edi, e2-2x, e2-5x, deblur, mpr, d2net."),
+                     "spike-hybrid, ours, colour-spikes, oracle; baselines bad, edi, e2-2x, e2-5x, deblur, "
+                     "mpr, d2net."),
     ] = "plain",
     field: Annotated[str, typer.Option(help="The model: splat, nerf (the paper's), nerf-fast (hash grid).")] = "splat",
     preset: Annotated[str, typer.Option(help="Effort: draft, standard, full; paper (field nerf).")] = "standard",

@@ -95,6 +95,8 @@ class FitConfig:
     half the scene's size about each axis (standard deviations, drawn by seed and view) are put onto the poses given; at
     the exposure's ends as much again, halved, in opposite directions.
 
+    `colour_weight` scales the colour term; 0 leaves the frames out: textures are all there is (colour spikes).
+
     TfS: `tfs_weight` in the reading `weight_reading` of Eq. TfS (`effective_weight` maps it); textures at
     `textures_per_view` instants, of kind `textures` (`both` = TFP and TFI, averaged to one residual by `tfs_combine`
     average, or two losses by sum; `tfi-window` = TFI over as many intervals as fit into `texture_window` ticks, the
@@ -190,6 +192,7 @@ class FitConfig:
     # colour term and camera
     colour_target: str = "frame"
     colour_loss: str = "l1ssim"
+    colour_weight: float = 1.0
     ssim_weight: float = 0.2
     poses_per_view: int = 1
     fresh_poses: int = 0
@@ -203,7 +206,7 @@ class FitConfig:
     knots_at: str = "even"
     path_from: str = "given"
     anchor: str = "mean"
-    lr_poses: float = 1e-3
+    lr_poses: float = 5e-3
     lr_poses_end: float = 0.01
     pose_noise_deg: float = 0.0
     pose_noise_share: float = 0.0

@@ -23,7 +23,7 @@ def _range_faults(config: FitConfig) -> list[tuple[bool, str]]:
         *((not 0 <= getattr(config, name) < 1e6, f"{name} must be 0 or more") for name in rates),
         *(
             (not 0 <= getattr(config, n) < 1e12, f"{n} must be 0 or more")
-            for n in ("noise", "tfs_weight", "seconds", "densify_grad", "exposure_tv")
+            for n in ("noise", "tfs_weight", "seconds", "densify_grad", "exposure_tv", "colour_weight")
         ),
         (not 0 <= config.sh_degree <= 3, "sh_degree must be 0 to 3"),
         (config.fresh_poses < 0, "fresh_poses must be 0 (all) or more"),
@@ -50,6 +50,8 @@ def _range_faults(config: FitConfig) -> list[tuple[bool, str]]:
         ),
         *_path_faults(config),
         *_baseline_faults(config),
+        (config.colour_weight == 0 and config.tfs_weight == 0, "without frames and textures there is nothing to fit"),
+        (config.colour_weight == 0 and config.ratio_until > 0, "a ratio target needs frames: colour_weight above 0"),
         (config.pose_label == "first" and config.colour_target == "truth", "the truth is not labelled by pose_label"),
     ]
 
@@ -74,7 +76,12 @@ def _restore_faults(config: FitConfig) -> list[tuple[bool, str]]:
         (not 0 <= config.restore_instants <= 99, "restore_instants must be 0 (off) to 99"),
         (not 0 <= config.restore_from <= 1, "restore_from is a fraction, 0 to 1"),
         (on and config.ratio_until > 0, "restored instants take the ratio targets' place: ratio_until must be 0"),
-        (on and config.colour_target == "truth", "the truth needs no restoring: restore_instants must be 0"),
+        (
+            on and config.colour_target != "frame",
+            "restored instants read the blurry frame: colour_target must be frame",
+        ),
+        (on and config.exposure != "off", "restored instants compare with the frame as it is: exposure must be off"),
+        (on and config.kernel_points > 0, "restored instants are moved by the trajectory: kernel_points must be 0"),
         (on and config.pose_label == "first", "instants are restored about mid-exposure: pose_label must be mid"),
         (on and config.tfs_weight > 0 and config.textures_per_view > 1, "with restored instants TfS has one texture"),
         (config.align_arms != "off" and not config.needs_spikes, "without spikes there are no arms to align"),

@@ -27,6 +27,7 @@ from spikerig.train.config import FitConfig, effective_weight
 from spikerig.train.converter import LEARNED, converter, start_converter
 from spikerig.train.field import Field, Model, Step, Tensors
 from spikerig.train.fields import field_of
+from spikerig.train.filters import tfs_through
 from spikerig.train.gauge import Gauge
 from spikerig.train.losses import average_exposure, l2_loss, light_of, mean_weights, tfs_loss
 from spikerig.train.model import BACKGROUNDS
@@ -216,6 +217,8 @@ def _pictures_loss(
         loss = len(targets.colour) / len(drawn) * colour_loss(exposed, view.frame, view.valid, config)
     else:  # only an instant with textures and no part in the average
         loss = torch.zeros(())
+    if config.colour_weight != 1:
+        loss = config.colour_weight * loss
     step.note("colour", loss)
     if task.weight > 0 and step.fraction >= config.tfs_from:
         step.note("tfs", task.weight * _tfs_term(state, task, view, pictures))
@@ -252,6 +255,10 @@ def _tfs_term(state: State, task: Task, view: TrainView, pictures: dict[float, T
     total = torch.zeros(())
     for phase in supervised:
         for texture, weight in view.instants[phase].textures:
+            if task.targets.filters is not None:
+                seen = (view.beside["site"], task.targets.filters.weights)
+                total = total + tfs_through(pictures[phase], texture, weight, *seen, task.config.tfs_domain)
+                continue
             total = total + tfs_loss(pictures[phase], texture, weight, gray, task.config.tfs_domain, heights)
     return total / len(supervised) if len(supervised) > 1 else total
 

@@ -175,8 +175,8 @@ def ratio_target(
 
     Args:
         frame_light: [H,W,3] linear light of the blurry frame.
-        texture: [H,W] texture at the instant, white at 1.
-        mean: [H,W] texture of the whole exposure, same units.
+        texture: [H,W] texture at the instant, white at 1; of colour spikes [H,W,3].
+        mean: texture of the whole exposure, same units and shape.
         known: bool[H,W] where both are known; the ratio is 1 elsewhere.
         eps: added to both, so that ratios of small counts stay near 1.
         low, high: bounds of the ratio.
@@ -187,5 +187,5 @@ def ratio_target(
     Source: the double-integral idea of EDI with counts instead of log events; gain and fixed pattern cancel.
     """
     ratio = ((texture + eps) / (mean + eps)).clamp(low, high)
-    ratio = torch.where(known, ratio, 1.0)
-    return srgb_from_linear((frame_light * ratio[..., None]).clamp(0.0, 1.0))
+    ratio = torch.where(known[..., None], ratio if ratio.ndim == 3 else ratio[..., None], 1.0)
+    return srgb_from_linear((frame_light * ratio).clamp(0.0, 1.0))

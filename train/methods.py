@@ -112,6 +112,20 @@ def ours(config: FitConfig) -> FitConfig:
     )
 
 
+def colour_spikes(config: FitConfig) -> FitConfig:
+    """Spikes of a colour sensor and nothing else: no frame is looked at. One of 5 instants a step."""
+    return replace(
+        config,
+        method="colour-spikes",
+        colour_weight=0.0,
+        tfs_weight=1.0,
+        textures_per_view=5,
+        fresh_poses=1,
+        textures="tfi-window",
+        texture_window=24,
+    )
+
+
 def oracle(config: FitConfig) -> FitConfig:
     """The ceiling: sharp truth at the training poses (simulated scenes only)."""
     return replace(config, method="oracle", colour_target="truth")
@@ -167,6 +181,7 @@ METHODS: dict[str, Callable[[FitConfig], FitConfig]] = {
     "spike-ratio": spike_ratio,
     "spike-hybrid": spike_hybrid,
     "ours": ours,
+    "colour-spikes": colour_spikes,
     "oracle": oracle,
     "edi": edi,
     "e2-2x": e2_2x,

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 NAME = "path"
 MIDDLE = PATH_PHASES.index(0.5)
 BETAS = (0.9, 0.95)
-START_PX = 1.0  # path length given to cameras that stand still: see `start`
+WARM = 0.15  # of the run, over which the rate grows from 0: before there is a scene, cameras fit nothing
+START_PX = 3.0  # path length given to cameras that stand still: see `start`
 
 
 def span_of(config: FitConfig) -> tuple[float, float, int]:
@@ -74,10 +75,11 @@ def pose(params: Tensors, view: TrainView, phase: float, given: Tensor, config: 
 
 @torch.no_grad()
 def descend(params: Tensors, moments: dict[str, tuple[Tensor, Tensor]], config: FitConfig, fraction: float) -> None:
-    """One step of the views that were looked at: Adam with one length for all of a view's numbers, at its own count.
+    """One step of the views that were looked at: Adam with two lengths a view (moving its path, bending it).
 
-    A view is looked at once an epoch; plain Adam would go on moving it in between. One length for all twelve (or more)
-    lets the directions go first that the pictures tell apart; a length each would shake the others at the same rate.
+    A view is looked at once an epoch; plain Adam would go on moving it in between. One length for many numbers lets the
+    directions go first that the pictures tell apart; a length each would shake the others at the same rate. The rate is
+    lr_poses, grown over the first WARM of the run, falling to lr_poses_end times that.
     """
     knots, looks, freedom = params["knots"], params["looks"], params["freedom"]
     if knots.grad is None:
@@ -85,17 +87,25 @@ def descend(params: Tensors, moments: dict[str, tuple[Tensor, Tensor]], config: 
     mean, square = moments["knots"]
     seen = torch.nonzero(knots.grad.abs().amax((1, 2)))[:, 0]
     looks[seen] += 1
-    gradient = knots.grad[seen]
+    gradient, count = knots.grad[seen], looks[seen][:, None, None]
     mean[seen] = BETAS[0] * mean[seen] + (1 - BETAS[0]) * gradient
-    size = gradient.square().mean((1, 2), keepdim=True)
-    square[seen] = BETAS[1] * square[seen] + (1 - BETAS[1]) * size
-    count = looks[seen][:, None, None]
-    length = torch.sqrt(square[seen] / (1 - BETAS[1] ** count))
-    rate = config.lr_poses * config.lr_poses_end**fraction * min(1.0, fraction / 0.15)
-    knots[seen] -= rate * mean[seen] / (1 - BETAS[0] ** count) / length.clamp(min=1e-20)
+    rate = config.lr_poses * config.lr_poses_end**fraction * min(1.0, fraction / WARM)
+    for k, (of_mean, of_gradient) in enumerate(
+        zip(_shared_and_own(mean[seen]), _shared_and_own(gradient), strict=True)
+    ):
+        size = of_gradient.square().mean((1, 2))[:, None]
+        square[seen, k] = BETAS[1] * square[seen, k] + (1 - BETAS[1]) * size
+        length = torch.sqrt(square[seen, k][:, None] / (1 - BETAS[1] ** count))
+        knots[seen] -= rate * of_mean / (1 - BETAS[0] ** count) / length.clamp(min=1e-20)
     if config.anchor == "mean":
         common = (freedom * knots.mean(1)[..., None]).sum((0, 1))
         knots -= (freedom @ common)[:, None]
+
+
+def _shared_and_own(gradient: Tensor) -> tuple[Tensor, Tensor]:
+    """What all knots of a view [V,K,6] have in common, which moves the path, and the rest, which bends it."""
+    shared = gradient.mean(1, keepdim=True).expand_as(gradient)
+    return shared, gradient - shared
 
 
 def start(task: Task) -> Tensors:
@@ -111,7 +121,7 @@ def start(task: Task) -> Tensors:
     where = np.linspace(-0.5, 0.5, count)[:, None]
     for number, view in enumerate(targets.views):
         poses = [instant.pose for instant in view.instants.values()]
-        if all(torch.equal(each, poses[0]) for each in poses):
+        if len(poses) > 1 and all(torch.equal(each, poses[0]) for each in poses):
             angle = np.random.default_rng((config.seed, 7, number)).uniform(0, 2 * np.pi)
             turn = START_PX / float(task.camera.K[0, 0])
             knots[number, :, :2] = where * turn * [np.cos(angle), np.sin(angle)]

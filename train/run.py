@@ -124,6 +124,7 @@ def prepare(
     record = records.new_record(config, about, scene.camera, gauge)
     record |= {
         "gray": None if found is None else found.as_json(),
+        "filters": None if targets.filters is None else targets.filters.as_json(),
         "effective_tfs_weight": task.weight,
         "remarks": [*targets.remarks, *(part.remark for part in parts_of(config) if part.remark)],
         "deblurred": targets.deblurred,
@@ -332,7 +333,8 @@ def _finish(state: State, watch: _Watch, record: dict[str, Any], ply: bool) -> d
     return {
         "run": str(watch.out), "method": watch.task.config.method, **done,
         "pose_label": watch.task.config.pose_label, "psnr": psnr, "seed": watch.task.config.seed,
-        "effective_tfs_weight": watch.task.weight, "gray": record["gray"], "remarks": record["remarks"],
+        "effective_tfs_weight": watch.task.weight, "remarks": record["remarks"],
+        "gray": record["gray"], "filters": record["filters"],
         "prepare_seconds": record["prepare_seconds"], "model_sha256": model_hash(state),
     }  # fmt: skip
 

@@ -17,7 +17,7 @@ from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.scene import Floats
 from spikerig.dataset.terminal import note
 from spikerig.train import metrics
-from spikerig.train.bridge import Bridge, Cameras, bridge, stored_cameras, true_pose
+from spikerig.train.bridge import Bridge, Cameras, bridge, estimated_poses, stored_cameras, true_pose
 from spikerig.train.field import Model
 from spikerig.train.metrics import SSIM_VARIANTS, rounded
 from spikerig.train.model import BACKGROUNDS, SplatModel
@@ -88,7 +88,7 @@ def bring_over(
     """
     if trained is None:
         return list(novel), list(blurred), None
-    estimated = estimated or "poses" in scene.info
+    estimated = estimated or estimated_poses(scene)
     found = bridge({n: true_pose(scene, n) for n in scene.train}, trained, estimated=estimated)
     if estimated:
         novel = [replace(e, pose=_true_exam_pose(scene, e)) for e in novel]

@@ -94,7 +94,7 @@ def trained_cameras(run: Run) -> tuple[Cameras | None, bool]:
     import numpy as np
 
     from spikerig.dataset.store import open_scene
-    from spikerig.train.bridge import stored_cameras
+    from spikerig.train.bridge import estimated_poses, stored_cameras
 
     if (moved := run.record.get("cameras")) is not None:
         try:
@@ -108,7 +108,7 @@ def trained_cameras(run: Run) -> tuple[Cameras | None, bool]:
         note(f"note: {run.scene} is gone, so poses are taken to be of the world the run was trained in")
         return None, False
     with open_scene(run.scene) as scene:
-        return stored_cameras(scene), "poses" in scene.info
+        return stored_cameras(scene), estimated_poses(scene)
 
 
 def _write(out: Path, run: Run, scene: Any, renders: dict[str, Any], judges: Any) -> Path:

@@ -7,7 +7,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,9 +15,12 @@ from spikerig.dataset import machine
 from spikerig.dataset.errors import UsageError
 from spikerig.dataset.terminal import Progress, emit, note
 
+if TYPE_CHECKING:
+    from spikerig.train.fit import State, Task
+
 
 def step_cost(scene: Path, *, splats: int, steps: int) -> list[dict[str, Any]]:
-    """CPU and wall seconds of a step for spikenerf with w = 0 and 1x, plain, and our methods.
+    """CPU and wall seconds of a step for spikenerf with w = 0 and 1x, plain, our methods, and optimised paths.
 
     Args:
         scene: a scene file.
@@ -39,11 +42,14 @@ def step_cost(scene: Path, *, splats: int, steps: int) -> list[dict[str, Any]]:
         "plain": configure("plain", "draft", splats=splats),
         "spike-ratio": configure("spike-ratio", "draft", splats=splats),
         "spike-hybrid": configure("spike-hybrid", "draft", splats=splats, ratio_until=0.0),
+        "spike-ratio, linear": configure("spike-ratio", "draft", splats=splats, trajectory="linear"),
+        "spike-ratio, cubic": configure("spike-ratio", "draft", splats=splats, trajectory="cubic"),
     }
     with open_scene(scene) as file:
         tasks = {name: prepare(file, scene, config)[0] for name, config in configs.items()}
         first = tasks["spikenerf 1x"]
         state = new_state(file.points, first)
+        states = {name: _with_parts(state, task) for name, task in tasks.items()}
     found: dict[str, list[tuple[float, float]]] = {name: [] for name in tasks}
     warm = 2 * len(first.targets.views)  # every view's sub-poses are remembered by then
     bar = Progress("cost step", warm + steps, "rounds")
@@ -53,7 +59,7 @@ def step_cost(scene: Path, *, splats: int, steps: int) -> list[dict[str, Any]]:
             for number in range(warm + steps):
                 for name, task in tasks.items():
                     cpu, wall = time.process_time(), time.perf_counter()
-                    one_step(state, task, 0.5)
+                    one_step(states[name], task, 0.5)
                     if number >= warm:
                         found[name].append((time.process_time() - cpu, time.perf_counter() - wall))
                 bar.step()
@@ -73,13 +79,26 @@ def step_cost(scene: Path, *, splats: int, steps: int) -> list[dict[str, Any]]:
     ]
 
 
+def _with_parts(state: State, task: Task) -> State:
+    """The same parameters and moments, with those of a task's parts beside them."""
+    import torch
+
+    from spikerig.train.parts import parts_of, start_parts
+
+    if not parts_of(task.config):
+        return state
+    mine = {name: p.requires_grad_() for name, p in start_parts(task).items()}
+    moments = {name: (torch.zeros_like(p), torch.zeros_like(p)) for name, p in mine.items()}
+    return replace(state, params=state.params | mine, moments=state.moments | moments)
+
+
 def step(
     scene: Annotated[Path, typer.Argument(help="A scene file (.h5) with spikes and trajectories.")],
     splats: Annotated[int, typer.Option(help="In every row.")] = 12_000,
     steps: Annotated[int, typer.Option(help="Timed steps of each row.")] = 300,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
 ) -> None:
-    """Cost of one training step: TfS 1x beside the same run with w = 0, and our methods."""
+    """Cost of one training step: TfS 1x beside the same run with w = 0, our methods, and optimised paths."""
     if min(splats, steps) < 1:
         raise UsageError("splats and steps must be at least 1", value=(splats, steps))
     rows, where = step_cost(scene, splats=splats, steps=steps), machine.describe()
@@ -88,7 +107,7 @@ def step(
         return
     for row in rows:
         typer.echo(
-            f"{row['row']:<18}{row['cpu_seconds'] * 1e3:>8.2f} CPU-ms {row['wall_seconds'] * 1e3:>8.2f} wall-ms "
+            f"{row['row']:<20}{row['cpu_seconds'] * 1e3:>8.2f} CPU-ms {row['wall_seconds'] * 1e3:>8.2f} wall-ms "
             f"{row['over_w0']:>+7.1%} CPU"
         )
     note(f"{rows[0]['size']}, {splats} splats; {machine.caption(where)}")

@@ -34,9 +34,11 @@ PAPER = {
     "spikenerf-5x": "SpikeNeRF 5x",
     "spikenerf": "SpikeNeRF",
 }
+EVERY = "all"
 ASKING = ("mpr", "d2net")  # methods that run only with a file of the user's: not among the default rows
 OWN_FLAGS = ("-o", "--out", "--method", "--field", "--preset", "--steps", "--seconds", "--seed", "--pose-label",
-             "--threads", "--resume", "--force", "--json", "--checkpoint-every", "--eval-every", "--ply")  # fmt: skip
+             "--threads", "--resume", "--force", "--json", "--score-on")  # fmt: skip
+CHECKPOINT_S = 15.0  # of a fit that is killed, at most so much is lost
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +74,7 @@ class Order:
 
     Args:
         scenes: files.
-        methods: names, each as METHOD or METHOD@LABEL; empty: all that need no file of the user's.
+        methods: names, each as METHOD or METHOD@LABEL; "all", or none: all that need no file of the user's.
         labels: pose labels of methods that name none.
         field, preset: of every fit; ONE field, so that costs compare.
         steps, seconds: length of every fit; both None: the preset's steps.
@@ -137,7 +139,9 @@ def plan(order: Order) -> Plan:
     """
     _check_numbers(order)
     scenes = _places(order)
-    methods = order.methods or tuple(m for m in sorted_methods(METHODS) if m not in ASKING or m in order.extra)
+    every = [m for m in sorted_methods(METHODS) if m not in ASKING or m in order.extra]
+    wanted = [every if text == EVERY else [text] for text in order.methods or (EVERY,)]
+    methods = tuple(dict.fromkeys(name for names in wanted for name in names))
     names = {s.name for s in scenes}
     faults = [f"--score-on: no scene '{name}'" for name in order.score_on if name not in names]
     faults += _scope_faults(order, names, {m.partition("@")[0] for m in methods})
@@ -248,21 +252,21 @@ def _configs(
 
 
 def settings_of(order: Order, scene: str, method: str) -> dict[str, Any]:
-    """What `--steps`, `--seconds` and `--set` change of a method's config on a scene."""
-    changes: dict[str, Any] = {}
+    """What `--steps`, `--seconds` and, over them, `--set` change of a method's config on a scene."""
+    changes: dict[str, Any] = {} if order.steps is None else {"steps": order.steps}
+    changes |= {} if order.seconds is None else {"seconds": order.seconds}
     for text in order.settings:
         scope, colon, _ = text.partition("=")[0].partition(":")
         if not colon:
             changes |= dict([parse_setting(text)])
         elif scope in (scene, method):
             changes |= dict([parse_setting(text.partition(":")[2])])
-    changes |= {} if order.steps is None else {"steps": order.steps}
-    return changes | ({} if order.seconds is None else {"seconds": order.seconds})
+    return changes
 
 
 def label_enters(config: FitConfig) -> bool:
     """Whether the pose label changes what is trained: some term looks at one instant alone."""
-    if config.colour_target == "truth":
+    if config.colour_target == "truth" or config.restore_instants > 0:  # these are about mid-exposure
         return False
     ratio = config.ratio_until > 0 and config.ratio_instants == 1
     colour = config.ratio_until < 1 and config.poses_per_view == 1
@@ -275,6 +279,7 @@ def _cell(order: Order, scene: Place, row: Row, seed: int, config: FitConfig) ->
     changes = settings_of(order, scene.name, row.method)
     fit = ["train", "fit", str(scene.path), "--method", row.method, "--field", order.field, "--preset", order.preset]
     fit += ["--seed", str(seed), *(["--pose-label", config.pose_label] if config.pose_label != "mid" else [])]
+    fit += ["--checkpoint-every", f"{CHECKPOINT_S:g}"]
     for name, value in changes.items():
         flag = [f"--{name}", f"{value:g}"] if name in ("steps", "seconds") else ["--set", f"{name}={_text(value)}"]
         fit += flag

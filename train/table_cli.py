@@ -21,8 +21,8 @@ def table(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the table.")],
     methods: Annotated[
         str,
-        typer.Option(help="Rows, comma-separated: METHOD, or METHOD@LABEL. Default: all that need no file of yours."),
-    ] = "",
+        typer.Option(help="Rows, comma-separated: METHOD, METHOD@LABEL, or all that need no file of yours."),
+    ] = "all",
     label: Annotated[
         str, typer.Option(help="Pose labels of rows that name none, comma-separated: mid, first; a row each.")
     ] = "mid",

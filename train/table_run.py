@@ -31,7 +31,6 @@ from spikerig.train.table import Cell, Plan
 CELL = "spikerig.train.table.cell/1"
 CELLS, TABLE, LOCK = "cells", "table.json", ".spikerig-table"  # the last is a lock, and says whose folder it is
 OUTPUTS = (TABLE, "table.md", "curves.svg", "crops.png")
-CHECKPOINT_S = 15.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,18 +216,22 @@ def run_cell(folder: Path, cell: Cell, crew: Crew, nerfbaselines: bool) -> dict[
     if record is None and folder.exists():  # not a cell: it cannot be told what its run is of
         shutil.rmtree(folder)
     folder.mkdir(exist_ok=True)
-    unmeasured = record is not None and (record["status"] == "running" or record.get("unmeasured", False))
+    lost = record is not None and record["status"] == "running" and not record.get("fit")
+    unmeasured = lost or (record is not None and bool(record.get("unmeasured")))  # what a killed table saw of a fit
     record = record or {"schema": CELL, "sha256": cell.sha256, "identity": dict(cell.identity), "attempts": []}
     kept = {"fit": record["fit"]} if record.get("fit") and (folder / "run/run.json").exists() else {}
     record = {k: record[k] for k in ("schema", "sha256", "identity", "attempts")} | kept
-    record |= {"status": "running", "error": None, "unmeasured": unmeasured}  # what a killed table saw of it is lost
+    record |= {"status": "running", "error": None, "unmeasured": unmeasured}
     write_json(folder / "cell.json", record)
-    steps = [] if kept else [("fit", [*cell.fit, "-o", str(folder / "run"), "--resume", "--checkpoint-every",
-                                      f"{CHECKPOINT_S:g}", "--threads", str(crew.threads)])]  # fmt: skip
+    run = ["-o", str(folder / "run"), "--resume", "--threads", str(crew.threads)]
+    steps = [] if kept else [("fit", [*cell.fit, *run])]
     steps += [(which, _score_words(folder, which, words, nerfbaselines)) for which, words in cell.scores]
     for what, words in steps:
         document, spent = child(what, [*words, "--json"], folder / "log.txt", crew)
         record["attempts"].append(asdict(spent))
+        if crew.stopping:
+            write_json(folder / "cell.json", record | {"status": "interrupted"})
+            raise Stopped
         if spent.exit != 0:
             record |= {"status": "failed", "error": _failure(what, document, spent.exit)}
             break
@@ -285,8 +288,6 @@ def child(what: str, words: Sequence[str], log: Path, crew: Crew) -> tuple[dict[
             with crew.guard:
                 crew.pids.discard(process.pid)
         process.returncode = os.waitstatus_to_exitcode(status)
-    if crew.stopping:
-        raise Stopped
     wall, cpu = time.monotonic() - begin, used.ru_utime + used.ru_stime
     spent = Spent(what, process.returncode, wall, cpu, used.ru_maxrss * (1 if sys.platform == "darwin" else 1024))
     try:

@@ -19,6 +19,7 @@ from spikerig.train import rolling
 from spikerig.train.arms import align
 from spikerig.train.config import FitConfig
 from spikerig.train.deblurred import Deblurred, deblurred, frame_light
+from spikerig.train.filters import Filters, check_colour, solve_filters
 from spikerig.train.gauge import Gauge
 from spikerig.train.gray import Gray, Pairs, solve
 from spikerig.train.losses import mean_weights, ratio_target, srgb_from_linear
@@ -73,7 +74,8 @@ class Targets:
     """All training views, the instants each term uses (fractions of the exposure), the converter, remarks.
 
     `also`: further instants that parts ask for. `given`: where cameras move, the poses [N,5,3,4] of the world that the
-    fit was given at PATH_PHASES. `deblurred`: how pictures were deblurred first, for run.json.
+    fit was given at PATH_PHASES. `deblurred`: how pictures were deblurred first, for run.json. `filters`: of
+    colour spikes, in place of `gray`.
     """
 
     views: tuple[TrainView, ...]
@@ -85,6 +87,7 @@ class Targets:
     also: tuple[float, ...] = field(default=())
     given: Floats = field(default_factory=lambda: np.zeros((0, len(PATH_PHASES), 3, 4)))
     deblurred: dict[str, Any] | None = None
+    filters: Filters | None = None
 
 
 def views_of_step(targets: Targets, seed: int, step: int, count: int = 1) -> list[TrainView]:
@@ -115,23 +118,27 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
 
     Raises:
         DataError: no training views, nothing valid in them, no spikes, no trajectory or no truth where the method
-            needs it; a colour spike camera.
+            needs it.
         NumericsError: true light that is not finite.
-        UsageError: single spikes are asked for, and the spike arm's lens bends; a restorer that is not there or may not
-            run.
+        UsageError: single spikes are asked for, and the spike arm's lens bends; settings that colour spikes do not go
+            with; a restorer that is not there or may not run.
     Cost: a texture takes milliseconds; memory 12 bytes a pixel and view, +4 a texture, +6 a ratio instant.
     """
     if not scene.train:
         raise DataError("this scene has no training views", value=scene.name, next="spikerig data info FILE")
     if config.colour_target == "truth" and not scene.has_truth:
         raise DataError("this method trains on the sharp truth", value=scene.name, expected=NEEDS_TRUTH)
-    if config.needs_spikes and bayer_of(scene.info) is not None:
-        raise DataError(
-            "the spikes of this scene see colours, and the losses on spikes compare gray",
-            value=scene.name,
-            expected="a scene of a gray spike camera, or a method without spikes",
-        )
     straight = straight_of(scene) if config.needs_spikes else Straight()
+    bayer = bayer_of(scene.info) if config.needs_spikes else None
+    if bayer is not None:
+        check_colour(config, straight)
+    elif config.colour_weight == 0:
+        raise DataError(
+            "spikes of a gray camera do not say what colour things have",
+            value=scene.name,
+            expected="a scene of a colour spike camera ([sensor] bayer), or frames beside the spikes",
+            next="--method spikenerf",
+        )
     if config.textures == "raw" and straight.resamples:
         raise UsageError(
             "single spikes cannot be brought to the scene's camera: its spike lens bends, and they would be blended",
@@ -144,8 +151,8 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
     ratio = phases(config.ratio_instants, "midpoints", config.pose_label) if config.ratio_until > 0 else ()
     if config.ratio_until >= 1:
         colour, tfs = ratio, (ratio if tfs else ())
-    if config.restore_instants > 0:
-        colour = ()  # the part has a colour term of its own
+    if config.restore_instants > 0 or config.colour_weight == 0:
+        colour = ()  # the part has a colour term of its own, or there is none
     parts = parts_of(config)
     also = tuple(dict.fromkeys(p for part in parts if part.instants is not None for p in part.instants(config)))
     sharper = deblurred(scene, config)
@@ -161,7 +168,8 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
             cause="an alignment that missed, or masks that are inverted",
             next="spikerig data check FILE",
         )
-    gray = solve(pairs, config.gray, scene.light_gain) if config.needs_spikes else None
+    gray = solve(pairs, config.gray, scene.light_gain) if config.needs_spikes and bayer is None else None
+    filters = None if bayer is None else solve_filters(raw, bayer, config.gray, scene.light_gain)
     remarks = _remarks(raw)
     if gray is not None and config.align_arms != "off":
         motion = align(raw, np.array([*gray.weights, gray.bias]), gray.white, config.align_arms)
@@ -174,10 +182,11 @@ def load_targets(scene: SceneFile, config: FitConfig, gauge: Gauge) -> Targets:
             f"frames were moved by {x:+.2f}, {y:+.2f} px to meet the spikes ({config.align_arms}; rms of the grays' "
             f"difference {motion.rms_before:.4f} -> {motion.rms_after:.4f} of white)",
         )
-    views = tuple(_finish(each, k, config, gauge, gray, (colour, tfs, ratio)) for k, each in enumerate(raw))
+    seen = gray if filters is None else filters
+    views = tuple(_finish(each, k, config, gauge, seen, (colour, tfs, ratio)) for k, each in enumerate(raw))
     given = [each["given"] for each in raw] if config.moves_cameras else np.zeros((0, len(PATH_PHASES), 3, 4))
     about = None if sharper is None else sharper.about
-    return Targets(views, colour, tfs, ratio, gray, remarks, also, np.array(given), about)
+    return Targets(views, colour, tfs, ratio, gray, remarks, also, np.array(given), about, filters)
 
 
 def _remarks(raw: list[dict[str, Any]]) -> tuple[str, ...]:
@@ -261,7 +270,7 @@ def _finish(
     number: int,
     config: FitConfig,
     gauge: Gauge,
-    gray: Gray | None,
+    seen: Gray | Filters | None,
     instants: tuple[tuple[float, ...], ...],
 ) -> TrainView:
     _, tfs, ratio = instants
@@ -270,18 +279,22 @@ def _finish(
     made: dict[float, Instant] = {}
     for phase, pose in raw["pose"].items():
         textures, target = (), torch.zeros(0, dtype=torch.half)
-        if gray is not None and phase in raw["textures"]:
+        if seen is not None and phase in raw["textures"]:
             found = raw["textures"][phase]
             averaged = average_texture(found)
             if phase in tfs or (ratio and config.tfs_weight > 0):
                 each = [averaged] if config.tfs_combine == "average" else [(t.light, t.known) for t in found]
-                textures = tuple(_tfs_target(a, k & valid, gray.white, config) for a, k in each)
+                textures = tuple(_tfs_target(a, k & valid, seen.white, config) for a, k in each)
             if phase in ratio:
+                now = averaged[0] / np.float32(seen.white), averaged[1]
+                mean = raw["mean"] / np.float32(seen.white), raw["mean_known"]
+                if isinstance(seen, Filters):
+                    now, mean = seen.colours(*now), seen.colours(*mean)
                 target = ratio_target(
                     clipped,
-                    torch.from_numpy(averaged[0] / np.float32(gray.white)),
-                    torch.from_numpy(raw["mean"] / np.float32(gray.white)),
-                    torch.from_numpy(averaged[1] & raw["mean_known"]),
+                    torch.from_numpy(now[0]),
+                    torch.from_numpy(mean[0]),
+                    torch.from_numpy(now[1] & mean[1]),
                     eps=config.ratio_eps,
                     low=config.ratio_min,
                     high=config.ratio_max,
@@ -292,11 +305,12 @@ def _finish(
     which = torch.tensor([number])
     late = None if raw["late"] is None else torch.from_numpy(raw["late"])
     frame = srgb_from_linear(clipped).contiguous()
-    return TrainView(raw["name"], frame, everywhere, made, None, which, raw["beside"], late)
+    beside = raw["beside"] | ({"site": torch.from_numpy(seen.site)} if isinstance(seen, Filters) else {})
+    return TrainView(raw["name"], frame, everywhere, made, None, which, beside, late)
 
 
 def _tfs_target(
-    light: NDArray, known: NDArray[np.bool_], white: float, config: FitConfig
+    light: NDArray, known: NDArray[np.bool_], white: float | NDArray[np.float32], config: FitConfig
 ) -> tuple[torch.Tensor, torch.Tensor]:
     texture = torch.from_numpy(np.ascontiguousarray(light / np.float32(white), np.float32))
     if config.highlights == "clip":

@@ -13,11 +13,13 @@ from framing_scenes import wire_bytes
 from spikerig.calib.panel_read import Spot
 from spikerig.dataset.cli import run
 from spikerig.dataset.errors import DataError, RefusedError, UsageError
+from spikerig.dataset.framing import Phase
 from spikerig.dataset.kernels import count
 from spikerig.dataset.marks import Sight, read_marks
 from spikerig.dataset.rawtake import WireBytes, open_take, read_lines, verify_take
 from spikerig.dataset.segments import Chunk, scan
 from spikerig.dataset.store import open_scene, verify_scene
+from spikerig.rigctl import ingest_times
 from spikerig.rigctl.ingest import IngestConfig, ingest
 from spikerig.rigctl.ingest_sights import panel_in_view, panel_pairs, sights
 from spikerig.rigctl.ingest_slips import MendedBytes
@@ -50,6 +52,17 @@ def test_ticks_begin_where_the_camera_began_them(taken: Path) -> None:
     told = open_take(taken)
     framing = Framing(WireBytes(told), [s for v in told.views() for s in v.spikes])
     assert framing.offset(0) == -first_byte(taken) % 384
+
+
+def test_viewpoints_tell_together_what_none_tells_alone(taken: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ingest_times, "find_phase", lambda *_: Phase(7, 0.5, "seam"))
+    told = open_take(taken)
+    spans = [s for v in told.views() for s in v.spikes]
+    assert Framing(WireBytes(told), spans).offset(0) == -first_byte(taken) % 384
+    noise = np.random.default_rng(3).integers(0, 256, 3 * 512 * 384, dtype=np.uint8)
+    wire = SimpleNamespace(take=told, read=lambda epoch, start, stop: (noise[start:stop], []))
+    with pytest.raises(RefusedError, match="where ticks begin"):
+        Framing(wire, [(0, k * 512 * 384, (k + 1) * 512 * 384) for k in range(3)]).offset(0)  # type: ignore[arg-type]
 
 
 def test_a_scene_right_in_time_and_place(taken: Path, tmp_path: Path) -> None:

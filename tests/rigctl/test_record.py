@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -158,7 +157,7 @@ def test_two_recorders_do_not_share_a_take(tmp_path: Path) -> None:
     assert take(folder, plan, Second()).status == "aborted"
 
 
-def child(folder: Path, *more: str) -> subprocess.Popen:
+def words_of(folder: Path) -> list[str]:
     plan, spec = folder.with_suffix(".plan.toml"), folder.with_suffix(".rig.toml")
     wire = "\n".join(f"{k} = {json.dumps(v)}" for k, v in WIRE.items())
     plan.write_text(
@@ -172,27 +171,44 @@ def child(folder: Path, *more: str) -> subprocess.Popen:
             for key in ("spike", "rgb", "box")
         ]
     ))  # fmt: skip
-    words = ["rig", "record", str(plan), "-o", str(folder), "--emulate", str(spec), "--json", *more]
-    return subprocess.Popen(
-        [sys.executable, "-m", "spikerig.dataset", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    return ["rig", "record", str(plan), "-o", str(folder), "--emulate", str(spec), "--json"]
 
 
-def first_view(folder: Path, process: subprocess.Popen) -> None:
-    until = time.monotonic() + 60
-    while not ((folder / "views.jsonl").exists() and (folder / "views.jsonl").stat().st_size):
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < until
-        time.sleep(0.02)
+HELD = """
+import sys
+from spikerig.dataset import cli
+from spikerig.rigctl.take_writer import TakeWriter
+real = TakeWriter.view
+def view(writer, seen):
+    real(writer, seen)
+    if seen.kept:
+        print("KEPT", file=sys.stderr, flush=True)
+        sys.stdin.readline()
+TakeWriter.view = view
+sys.exit(cli.run(sys.argv[1:]))
+"""
+
+
+def held_after_the_first_view(words: list[str]) -> subprocess.Popen:
+    """A take that waits for a line on stdin as soon as a viewpoint is kept: whatever the machine does meanwhile."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HELD, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        text=True,
+    )  # fmt: skip
+    assert process.stderr is not None
+    said = []
+    while "KEPT\n" not in said:
+        said.append(process.stderr.readline())
+        assert said[-1], said
+    return process
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
 def test_a_take_that_was_killed_or_interrupted_goes_on(tmp_path: Path, number: int) -> None:
     folder = tmp_path / "take"
-    process = child(folder)
-    first_view(folder, process)
+    process = held_after_the_first_view(words_of(folder))
     os.kill(process.pid, number)
-    out, _ = process.communicate(timeout=60)
+    out, _ = process.communicate("\n")
     told = open_take(folder)
     if number == signal.SIGINT:
         assert process.returncode == 130
@@ -203,8 +219,9 @@ def test_a_take_that_was_killed_or_interrupted_goes_on(tmp_path: Path, number: i
     kept = [v.name for v in told.views() if v.kept]
     assert kept
     before = {v.name: v.spikes for v in told.views() if v.kept}
-    again = child(folder, "--resume")
-    out, err = again.communicate(timeout=60)
+    words = [sys.executable, "-m", "spikerig.dataset", *words_of(folder), "--resume"]
+    again = subprocess.run(words, capture_output=True, text=True)
+    out, err = again.stdout, again.stderr
     assert again.returncode == 0, err
     result = json.loads(out)
     assert (result["kept"], result["status"]) == (3, "complete")

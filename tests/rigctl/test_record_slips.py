@@ -60,14 +60,15 @@ def test_a_loss_within_a_viewpoint_is_told_at_once_and_taken_again(calm: Path, t
     assert (scene["slips"], scene["lost_ticks"]) == ([], 0)
 
 
-def test_a_loss_between_viewpoints_begins_an_epoch_and_costs_no_viewpoint(calm: Path, tmp_path: Path) -> None:
+def test_a_loss_after_a_viewpoints_spikes_begins_an_epoch_for_all_that_follow(calm: Path, tmp_path: Path) -> None:
     folder = tmp_path / "take"
     first = open_take(calm).views()[0]
     dropped(folder, first.stop_ns / 1e9 - 0.65, 20)  # its spikes are over, and the camera stops
     (told,) = log(folder, "transport")
     assert told["lost_bytes"] % 384 == 20
-    assert [{e for e, _, _ in v.spikes} for v in open_take(folder).views()] == [{0}, {1}, {1}]
-    assert all(t["attempt"] == 1 for _, t in read_lines(folder / "views.jsonl"))
+    views = open_take(folder).views()
+    assert [{e for e, _, _ in v.spikes} for v in views] == [{1}, {1}, {1}]
+    assert [v.attempt for v in views] == [2, 1, 1]  # its camera had not stopped yet: taken again, to be sure
     scene = ingest(folder, tmp_path / "s.h5")
     assert (scene["slips"], scene["lost_ticks"]) == ([], 0)
     assert not [why for why in scene["left_out"].values() if "two places" in why]

@@ -127,7 +127,7 @@ def test_tests_are_rationed_and_what_was_not_tested_is_counted():
         told.append(watch.add(0, k * len(part), part))
     assert told == [None] * 24
     assert watch.untested == tested.count(False) > 0
-    assert 4 <= tested.count(True) <= 2 * (4 + watch.looks // 64 + 1)
+    assert 4 <= tested.count(True) <= 2 * (4 + watch.looks // 16 + 1)
 
 
 def test_pieces_of_any_size_are_followed():

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from spikerig.train.claims import ABSENT, FAILS, HOLDS, TOLD, claims
+from spikerig.train.claims import ABSENT, FAILS, HOLDS, OPEN, TOLD, claims
 from spikerig.train.table_numbers import cost_to_match, equal_dB, means, reach
 from spikerig.train.table_page import page
 from spikerig.train.table_pictures import curves, liveliest
@@ -176,9 +176,12 @@ def test_a_quarter_of_the_cost_both_ways():
 
 
 def test_a_cost_that_is_censored_never_holds_however_little_was_spent():
-    never = history((0, 10), (1, 25.9))
+    never = history((0, 10), (40, 25.9))
     found = cost_claim(dict.fromkeys(SCENES, never))
     assert (found["verdict"], found["censored"], found["margin"]) == (FAILS, True, None)
+    never = history((0, 10), (1, 25.9))
+    found = cost_claim(dict.fromkeys(SCENES, never))
+    assert (found["verdict"], found["censored"], found["margin"]) == (OPEN, True, None)  # it was not given a quarter
     assert "> 2 CPU s of 200" in found["text"]
     assert "not reached in 2 of 2 cells" in found["text"]
 

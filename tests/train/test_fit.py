@@ -28,7 +28,10 @@ def fit(tiny, out, method="plain", **changes):
     return run_fit(tiny, configure(method, "draft", **(SMALL | changes)), out, **options)
 
 
-@pytest.mark.parametrize("method", [m for m in METHODS if m not in ("mpr", "d2net")])  # those need a network
+NEED_MORE = ("mpr", "d2net", "colour-spikes")  # a network, a colour sensor
+
+
+@pytest.mark.parametrize("method", [m for m in METHODS if m not in NEED_MORE])
 def test_every_method_trains_and_says_what_it_did(tiny, tmp_path, method):
     done = fit(tiny, tmp_path / "run", method)
     assert done["steps"] == 40

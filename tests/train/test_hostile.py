@@ -43,7 +43,7 @@ def one_view(scene):
     views = (next(v for v in scene.views if v.split == "train"), *held_out)
     names = {v.name for v in views}
     truth = replace(scene.truth, **{part: _some(getattr(scene.truth, part), names) for part in PER_VIEW})
-    return replace(scene, views=views, truth=truth)
+    return replace(scene, views=views, truth=truth, events=_some(scene.events, names))
 
 
 PER_VIEW = ("light", "trajectories", "at_ns")

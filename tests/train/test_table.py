@@ -367,14 +367,17 @@ def test_the_pose_label_makes_a_row_only_where_it_enters(tiny):
     assert [row.name for row in laid.rows] == ["plain@mid", "plain@first", "average", "oracle"]
     assert not label_enters(configure("spike-hybrid", "draft"))
     assert not label_enters(configure("spikenerf-5x", "draft"))
+    assert not label_enters(configure("ours", "draft"))
+    assert label_enters(configure("edi", "draft"))
     assert label_enters(configure("spikenerf-5x", "draft", textures_per_view=1))
     by_name = {cell.row.name: cell.identity["config"]["pose_label"] for cell in laid.cells}
     assert (by_name["plain@mid"], by_name["plain@first"]) == ("mid", "first")
 
 
 def test_settings_of_a_scene_and_of_a_row(tiny, small):
-    settings = ("splats=50", "tiny:background=white", "oracle:splats=70")
-    laid = plan(Order((tiny, small), methods=("plain", "oracle"), settings=settings))
+    settings = ("splats=50", "tiny:background=white", "oracle:splats=70", "oracle:steps=8")
+    laid = plan(Order((tiny, small), methods=("plain", "oracle"), settings=settings, steps=5))
+    assert {(c.row.method, c.identity["config"]["steps"]) for c in laid.cells} == {("plain", 5), ("oracle", 8)}
     found = {
         (c.scene, c.row.method): (c.identity["config"]["splats"], c.identity["config"]["background"])
         for c in laid.cells

@@ -36,14 +36,6 @@ def changed(tiny, tmp_path, **changes):
     return tmp_path / "changed.h5"
 
 
-def test_a_scene_of_a_colour_spike_camera_is_refused_where_gray_is_compared(tiny, tmp_path):
-    path = changed(tiny, tmp_path, info={"sensor": {"bayer": "rggb"}})
-    for method in ("spikenerf", "spike-ratio"):
-        with pytest.raises(DataError, match="see colours"):
-            targets(path, method)
-    targets(path, "oracle")
-
-
 def test_the_calibrated_converter_is_that_of_the_simulator(tiny):
     gray = targets(tiny, "spikenerf").gray
     assert gray is not None
@@ -148,7 +140,7 @@ def test_no_trajectory_no_truth_no_training_views(tiny, tmp_path):
     with pytest.raises(DataError, match="sharp truth"):
         targets(path, "oracle")
     held_out = tuple(v for v in scene.views if v.split == "test")
-    write_scene(path, replace(scene, truth=None, views=held_out), force=True)
+    write_scene(path, replace(scene, truth=None, events={}, views=held_out), force=True)
     with pytest.raises(DataError, match="no training views"):
         targets(path, "plain")
 

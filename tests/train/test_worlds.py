@@ -287,3 +287,22 @@ def test_equal_pictures_are_graded(tiny, oracle):
     found = grade(model, [same])
     assert found["psnr"] == float("inf")
     assert "equal" in found["views"][0]["remarks"][0]
+
+
+def test_poses_of_a_transforms_file_are_given_not_estimated(tiny, oracle, tmp_path, capsys):
+    """Held-out pictures alone, whose poses came with them, are scored in their own world."""
+    with open_scene(tiny) as file:
+        scene = file.read()
+    views = tuple(view for view in scene.views if view.split == "test")
+    mine = {
+        kind: {v.name: record[v.name] for v in views if v.name in record}
+        for kind in ("light", "trajectories", "at_ns")
+        if (record := getattr(scene.truth, kind)) is not None
+    }
+    alone = replace(scene, views=views, events={}, truth=replace(scene.truth, **mine))
+    write_scene(tmp_path / "estimated.h5", replace(alone, info={"poses": {"accepted": True}}))
+    assert "no training view" in score(capsys, oracle, tmp_path / "estimated.h5", code=4)["error"]["what"]
+    write_scene(tmp_path / "given.h5", replace(alone, info={"poses": "transforms_val.json"}))
+    found = score(capsys, oracle, tmp_path / "given.h5")
+    assert found["novel_view_aligned"] is None
+    assert found["psnr"] == score(capsys, oracle)["psnr"]

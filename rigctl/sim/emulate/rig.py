@@ -22,7 +22,6 @@ from spikerig.rigctl.gopro_http import Web
 from spikerig.rigctl.gopro_radio import Radio
 from spikerig.rigctl.led_view import LedPlan, led_mask
 from spikerig.rigctl.panel_view import PanelPlan, centres, mask
-from spikerig.rigctl.record import Rig
 from spikerig.rigctl.sim.emulate.gopro_air import Air
 from spikerig.rigctl.sim.emulate.gopro_camera import Faults as RgbFaults
 from spikerig.rigctl.sim.emulate.gopro_camera import GoProCamera, Nature
@@ -41,6 +40,7 @@ from spikerig.rigctl.sim.emulate.world import PanelSeen, Ticker, world_of
 from spikerig.rigctl.sim.limits import Faults, limits, read_record
 from spikerig.rigctl.syncbox import HarpBox
 from spikerig.rigctl.take_plan import TakePlan
+from spikerig.rigctl.tally import Rig
 from spikerig.rigctl.vidar import VidarSource
 
 R = TypeVar("R")
