@@ -23,6 +23,7 @@ _R, _L, _C = "rigctl/test_recorder.py::", "rigctl/test_record.py::", "rigctl/tes
 _G, _H, _A, _P = (f"rigctl/test_gopro{k}.py::" for k in ("", "_web", "_wire", "_hand"))
 _B, _F, _X = "rigctl/test_syncbox.py::", "rigctl/test_harpbox.py::", "rigctl/test_harp.py::"
 _D, _S, _N = "rigctl/test_clockd.py::", "rigctl/test_clockd_wire.py::", "numerics/test_clock.py::"
+_Z, _Q = "rigctl/test_record_slips.py::", "rigctl/test_pulse.py::"
 _I, _M = "rigctl/test_ingest.py::", "rigctl/test_rawsource.py::"
 
 
@@ -58,6 +59,14 @@ SPIKE = [
         "new epoch `rate`, with the bytes it lies among as suspect", USB,
         _V + "test_a_silent_loss_is_seen_from_the_time_and_its_place_is_bounded", _V + "test_no_loss_is_unseen",
         _W + "test_a_loss_that_no_error_tells_is_in_the_gap_record_with_its_suspects"),
+    row("bytes missing that neither an error nor the time tells", "seen by where ticks begin, while recording: new "
+        "epoch `framing`, with its confidence; the viewpoint is taken again", USB,
+        _Z + "test_a_loss_within_a_viewpoint_is_told_at_once_and_taken_again",
+        _Z + "test_a_loss_after_a_viewpoints_spikes_begins_an_epoch_for_all_that_follow",
+        _I + "test_a_loss_that_time_cannot_see_becomes_lost_ticks"),
+    row("framing after a loss", "found again by correlation with the picture before, told with its confidence", USB,
+        _W + "test_after_a_loss_the_framing_is_found_again_and_told",
+        "rigctl/test_slip_watch.py::test_after_a_told_loss_the_framing_is_found_again_with_its_confidence"),
     row("a late host (no loss)", "not taken for a loss", USB,
         _V + "test_a_busy_host_sees_no_loss_where_there_is_none", _V + "test_memory_in_the_camera_bridges_a_late_host"),
     row("a mode that the link cannot carry", "plan refused with the numbers (exit 2), no device touched; on the wire: "
@@ -172,6 +181,8 @@ CLOCK = [
     row("a burst of outliers", "within 150 us during and after", SERIAL,
         _S + "test_a_burst_of_late_answers_does_not_pull_the_map"),
     row("a temperature ramp", "within 100 us at 5 ppm/min", SERIAL, _S + "test_a_warming_crystal_is_followed"),
+    row("a minute without the box, at a take's default rate of questions", "within 100 us", SERIAL,
+        _Q + "test_the_default_rate_carries_through_a_minute_within_100_us"),
     row("unplugged", "hold-over, with what it is good to; the same epoch if the box kept its time", SERIAL,
         _D + "test_unplugged_it_holds_over_and_goes_on_in_the_same_epoch", _D + "test_a_box_that_is_not_there_yet"),
 ]  # fmt: skip

@@ -76,7 +76,12 @@ def _restore_faults(config: FitConfig) -> list[tuple[bool, str]]:
         (not 0 <= config.restore_instants <= 99, "restore_instants must be 0 (off) to 99"),
         (not 0 <= config.restore_from <= 1, "restore_from is a fraction, 0 to 1"),
         (on and config.ratio_until > 0, "restored instants take the ratio targets' place: ratio_until must be 0"),
-        (on and config.colour_target == "truth", "the truth needs no restoring: restore_instants must be 0"),
+        (
+            on and config.colour_target != "frame",
+            "restored instants read the blurry frame: colour_target must be frame",
+        ),
+        (on and config.exposure != "off", "restored instants compare with the frame as it is: exposure must be off"),
+        (on and config.kernel_points > 0, "restored instants are moved by the trajectory: kernel_points must be 0"),
         (on and config.pose_label == "first", "instants are restored about mid-exposure: pose_label must be mid"),
         (on and config.tfs_weight > 0 and config.textures_per_view > 1, "with restored instants TfS has one texture"),
         (config.align_arms != "off" and not config.needs_spikes, "without spikes there are no arms to align"),

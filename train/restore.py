@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from spikerig.calib.straight import Straight, straight_of
+from spikerig.dataset.errors import DataError
 from spikerig.dataset.texture import Texture
 from spikerig.train.config import FitConfig
 from spikerig.train.field import Step, Tensors
@@ -82,9 +83,20 @@ def intervals_at(stream: SpikeStream, tick: float, window: int, straight: Straig
 
 def read(scene: SceneFile, view: View, config: FitConfig) -> dict[str, Tensor]:
     """Of a view: the exposure's mean of the spikes [H,W], and by instant the interval there (light, relative variance,
-    first and last as fractions of the exposure) as `instant J` [H,W,4]."""
+    first and last as fractions of the exposure) as `instant J` [H,W,4].
+
+    Raises:
+        DataError: a rolling shutter under a field of rays.
+    """
     from spikerig.train.spikelight import exposures, light_at, spike_tick, spikes_of
 
+    if view.frame.row_ns and config.field != "splat":
+        raise DataError(
+            "fields of rays follow a rolling shutter's rows, and restored instants do not",
+            value=f"view '{view.name}', {view.frame.row_ns} ns a row",
+            expected="field splat, or a method of which every row has its own instant",
+            next="--field splat, or --method spike-ratio",
+        )
     straight, stream = straight_of(scene), spikes_of(view)
     begin, end = (spike_tick(view, view.instant_ns(phase), scene.clock) for phase in (0.0, 1.0))
     (mean,) = light_at(view, 0.5, None, scene.clock, straight, exposures(view, scene.clock))

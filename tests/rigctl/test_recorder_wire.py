@@ -17,12 +17,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from framing_scenes import wire_bytes
 from vidar_bench import MID, MS, camera
 
 from spikerig.dataset.errors import DeviceError
+from spikerig.dataset.framing import find_phase, rates_at
 from spikerig.dataset.segments import PAGE, Chunk, Damage, scan
 from spikerig.rigctl.recorder import SLOW, Recorder, RecorderOptions
 from spikerig.rigctl.segment_writer import SegmentWriter
+from spikerig.rigctl.sim.emulate.spikewire import Loop
 from spikerig.rigctl.vidar import VidarSource
 
 S = 1000 * MS
@@ -121,6 +124,24 @@ def test_a_loss_that_no_error_tells_is_in_the_gap_record_with_its_suspects(tmp_p
     before = np.concatenate([c.read() for c in chunks if c.head.epoch == 0])[-gap.suspect :]
     steps = np.diff(before.view(np.uint32).astype(np.int64)) - 1
     assert 4 * steps.max() == 6400  # it lies among the suspect bytes
+
+
+def test_after_a_loss_the_framing_is_found_again_and_told(tmp_path: Path) -> None:
+    data = wire_bytes(MID, "texture", 256)
+    host, bus, _ = camera(MID, Loop(data), faults=[{"kind": "overflow", "at_s": 0.5}], ram_bytes=2_000_000)
+    told: list[dict[str, Any]] = []
+    options = RecorderOptions(ring_s=0.5, on_full="wait")
+    run = Run(Recorder(VidarSource(MID, host, bus), tmp_path, host, 1, options=options, event=told.append), bus, told)
+    record(run, 1.0)
+    (found,) = [t for t in told if t["kind"] == "framing"]
+    raw = {c.head.epoch: c for path in sorted(tmp_path.glob("*.seg")) for c in reversed(list(scan(path, take=1)))
+           if isinstance(c, Chunk)}  # fmt: skip
+    size = 64 * MID.tick_bytes
+    begin = {e: find_phase(np.resize(raw[e].read()[:size], size), MID, like=rates_at(data, MID, 0)) for e in (0, 1)}
+    assert min(b.confidence for b in begin.values()) > 0.999
+    starts = {e: (raw[e].head.byte_index + begin[e].offset) % MID.tick_bytes for e in (0, 1)}
+    assert found["shift"] == (starts[1] - starts[0]) % MID.tick_bytes
+    assert found["confidence"] > 0.999
 
 
 def test_a_camera_that_stays_away_costs_nothing_that_came(tmp_path: Path) -> None:

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from spikerig.calib.straight import Straight
-from spikerig.dataset.errors import UsageError
+from spikerig.dataset.errors import DataError, UsageError
 from spikerig.dataset.images import srgb_from_linear
 from spikerig.dataset.spikes import SpikeStream
-from spikerig.dataset.store import open_scene
+from spikerig.dataset.store import open_scene, write_scene
 from spikerig.train import restore
 from spikerig.train.fit import Task, new_state, one_step
 from spikerig.train.gauge import Gauge
@@ -126,6 +126,9 @@ def test_a_model_that_explains_everything_is_left_alone(tiny):
     view = replace(view, frame=frame, beside=beside)
     made = restore.restored(view, 2, lights, torch.ones(40, 64), task, early=False)
     assert float((linear_from_srgb(made) - lights[2]).abs().max()) < 2e-3
+    doubled = {"instant 2": torch.stack([said * 2, torch.full_like(said, 1e-3), first, last], -1)}
+    keen = restore.restored(replace(view, beside=beside | doubled), 2, lights, torch.full((40, 64), 2.0), task, False)
+    assert float((linear_from_srgb(keen) - lights[2]).abs().max()) < 2e-3  # pixels twice as sensitive
     dark = {"instant 2": torch.stack([said / 2, torch.full_like(said, 1e-3), first, last], -1)}
     halved = restore.restored(replace(view, beside=beside | dark), 2, lights, torch.ones(40, 64), task, early=False)
     assert float((linear_from_srgb(halved) / lights[2]).mean()) == pytest.approx(0.5, abs=0.03)
@@ -170,12 +173,12 @@ def test_unknown_pixels_take_the_frame_s_word(tiny):
 @pytest.mark.parametrize("field", ["splat", "nerf-fast"])
 def test_ours_trains_every_field(tiny, field):
     changes = {"splats": 600} if field == "splat" else {"rays": 64, "fine": 16}
-    config = configure("ours", "draft", field, steps=40, **changes)
+    config = configure("ours", "draft", field, steps=24, **changes)
     with open_scene(tiny) as scene:
         task, record = prepare(scene, tiny, config)
         state = new_state(scene.points, task)
     assert record["renders_per_step"] == {"ratio": 0, "average": 5}
-    losses = [one_step(state, task, k / 40) for k in range(40)]
+    losses = [one_step(state, task, k / 24) for k in range(24)]
     assert np.mean(losses[-5:]) < np.mean(losses[:5])
     assert torch.equal(state.params["restore:flat"], restore.start(task)["flat"])  # not trained
 
@@ -202,11 +205,36 @@ def test_instants_follow_the_trajectory(tiny):
         assert task.targets.views[0].instants[phase].pose.numpy() == pytest.approx(want)
 
 
+def test_a_rolling_shutter_under_rays_is_refused(tiny, tmp_path):
+    with open_scene(tiny) as file:
+        scene = file.read()
+    frame = replace(scene.views[0].frame, row_ns=100, start_ns=scene.views[0].frame.start_ns - 100 * 20)
+    path = tmp_path / "rolling.h5"
+    write_scene(path, replace(scene, views=(replace(scene.views[0], frame=frame), *scene.views[1:])))
+    with open_scene(path) as opened, pytest.raises(DataError, match="rolling"):
+        load_targets(opened, configure("ours", "draft", "nerf-fast"), UNIT)
+
+
+@pytest.mark.parametrize("trajectory", ["linear", "cubic"])
+def test_ours_trains_along_a_trajectory_that_is_trained_too(tiny, trajectory):
+    config = configure("ours", "draft", steps=20, splats=300, trajectory=trajectory)
+    with open_scene(tiny) as scene:
+        task, _ = prepare(scene, tiny, config)
+        state = new_state(scene.points, task)
+    before = {n: p.detach().clone() for n, p in state.params.items() if n.startswith("path:")}
+    for k in range(12):
+        one_step(state, task, k / 20)
+    assert before
+    assert any(not torch.equal(before[n], state.params[n]) for n in before)
+
+
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
         ({"ratio_until": 0.5}, "ratio_until"),
-        ({"colour_target": "truth"}, "truth"),
+        ({"colour_target": "truth"}, "colour_target"),
+        ({"exposure": "affine"}, "exposure"),
+        ({"kernel_points": 4}, "kernel_points"),
         ({"pose_label": "first"}, "pose_label"),
         ({"restore_from": 1.5}, "restore_from"),
         ({"restore_instants": 0, "align_arms": "shift"}, "arms"),
