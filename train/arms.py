@@ -137,7 +137,7 @@ def _keys(f: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
 def sources(height: int, width: int, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Where in the frames the spikes' pixels are [H,W,2], pixels, centres at halves."""
     here = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
-    return here + np.moveaxis(np.tensordot(matrix, _base(height, width), 1), 0, -1)
+    return np.asarray(here + np.moveaxis(np.tensordot(matrix, _base(height, width), 1), 0, -1), np.float64)
 
 
 def _base(height: int, width: int) -> NDArray[np.float64]:

@@ -240,7 +240,7 @@ class FitConfig:
     kernel_points: int = 0
     kernel_start: float = 0.02
     kernel_align: float = 0.01
-    lr_kernel: float = 5e-3
+    lr_kernel: float = 1e-2
     restorer: str = ""
     trust: bool = False
     restorer_frames: int = 1

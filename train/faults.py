@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from spikerig.train.config import FitConfig
 
 
-def faults_of(config: FitConfig) -> list[str]:
-    """All faults of a config but for words that are no choice."""
+def faults_of(config: Any) -> list[str]:
+    """All faults of a FitConfig but for words that are no choice."""
     return [text for wrong, text in _range_faults(config) if wrong]
 
 

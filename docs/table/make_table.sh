@@ -4,10 +4,10 @@
 # DATA: a folder like NeRF's synthetic `mic` (train/, val/, transforms_*.json); without it the twins are left out.
 # Given again after an interruption, it goes on where it was.
 set -euo pipefail
-OUT=${1:-runs/table}; STEPS=${2:-1200}; JOBS=${JOBS:-2}; SIZE=${SIZE:-200x200}; EVERY=${EVERY:-3}
+OUT=${1:-runs/table}; STEPS=${2:-1000}; JOBS=${JOBS:-2}; SIZE=${SIZE:-160x160}; EVERY=${EVERY:-4}
 SHARP=${SHARP:-3000}; FAST=${FAST:-2000}  # steps of the two sharp models behind the twins
 SCENES=${SCENES:-"leaves glossy fabric"}; HERE=docs/table
-ROWS=all,plain@first,spikenerf@first
+ROWS=${ROWS:-plain,plain@first,deblur,edi,e2-5x,e2-2x,spikenerf-5x,spikenerf,spikenerf@first,average,bad,ours,oracle}
 run() { echo "+ $*"; "$@"; }
 once() { [ -e "$1" ] || { shift; run "$@"; }; }
 mkdir -p "$OUT"; files=(); more=()
@@ -33,7 +33,7 @@ if [ -n "${DATA:-}" ]; then
       --background white --eval-every 0 --resume -o "$OUT/sharp-$field"
     once "$OUT/$twin.h5" spikerig train score "$OUT/sharp-$field" "$OUT/val.h5"
     once "$OUT/$twin.h5" spikerig train render "$OUT/sharp-$field" --scene "$OUT/split.h5" --path shake --format exr \
-      --shake-px 8 13 --seed 0 --force -o "$OUT/shaken-$field"
+      --shake-px 6 10 --seed 0 --force -o "$OUT/shaken-$field"
     once "$OUT/$twin.h5" spikerig sim frames "$OUT/shaken-$field" --settings $HERE/twin.toml --workers "$JOBS" -o "$OUT/$twin.h5"
     files+=("$OUT/$twin.h5"); more+=(--score-on "$twin=$OUT/val.h5" --set "$twin:background=white")
   done

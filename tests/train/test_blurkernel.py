@@ -161,12 +161,15 @@ def test_every_number_of_the_kernel_is_trained(tiny, field):
     task, points = tiny_task(tiny, field, **small)
     state = new_state(points, task)
     view = task.field.look(task.targets, task.camera, task.config, 0, np.random.default_rng(0))
-    view_loss(state, task, view, step()).backward()
+    view_loss(state, task, view, step(0.95)).backward()  # without the alignment, which is no picture's gradient
     for name in own(KERNEL, state.params):
         grad = state.params[f"kernel:{name}"].grad
         assert grad is not None
         assert torch.isfinite(grad).all()
         assert grad.abs().max() > 0, name
+    last = state.params["kernel:out/bias"].grad  # origins (of rays), displacements, weight
+    assert last is not None
+    assert (last[2 if field == "splat" else 0 :] != 0).all()
 
 
 def test_rays_are_traced_from_every_point_of_the_kernel(tiny):

@@ -139,6 +139,7 @@ def test_a_fit_trains_on_what_it_restored_and_records_the_file(swept, trained, t
     record = json.loads((tmp_path / "run/run.json").read_text())
     assert record["deblurred"]["sha256"] == scene_hash(trained)
     assert record["deblurred"]["how"] == "restorer"
+    run_fit(swept, config(trained, **longer), tmp_path / "run", resume=True, eval_every=0)  # the same file goes on
     other = script(Sharpener(), tmp_path / "other.pt")
     trained_bytes = trained.read_bytes()
     try:

@@ -95,7 +95,7 @@ def test_a_table_end_to_end_with_a_cell_that_fails(tiny, tmp_path, capsys):
     again = told(capsys, *words, "--extra", "spikenerf=--gray green", "--resume", code=1)
     assert (cell / "cell.json").stat().st_mtime_ns == before
     assert again["cells"][0] == good
-    assert len(read_cell(tmp_path / "t/cells/tiny-spikenerf-mid-0")["attempts"]) == 2
+    assert len(recorded(tmp_path / "t/cells/tiny-spikenerf-mid-0")["attempts"]) == 2
     refused = told(capsys, *words, "--resume", "--set", "lr_means=1e-4", code=2)["error"]
     assert "lr_means" in refused["value"]
     assert "extra" in refused["value"]
@@ -137,6 +137,13 @@ def test_kill_9_of_table_and_fit_and_resume(tiny, tmp_path):
     assert record["unmeasured"]
     assert record["fit"]["steps"] == 1000
     assert "going on at step" in (out / CELLS / "tiny-plain-mid-0/log.txt").read_text()
+
+
+def recorded(folder: Path) -> dict:
+    """The record of a cell that has one."""
+    record = read_cell(folder)
+    assert record is not None
+    return record
 
 
 def wait_for(true, seconds: float = 180.0) -> None:
@@ -233,7 +240,7 @@ def test_an_interrupted_cell_is_left_to_be_gone_on_with(laid, tmp_path, monkeypa
     folder = tmp_path / CELLS / laid.cells[0].name
     with pytest.raises(Stopped):
         run_cell(folder, laid.cells[0], crew, False)
-    assert read_cell(folder)["status"] == "interrupted"
+    assert recorded(folder)["status"] == "interrupted"
 
 
 def test_a_child_in_a_table_that_stops_is_not_started(tmp_path):
