@@ -13,6 +13,7 @@ ROWS = [
     ("0 and pi in one batch", "exp_se3, log_se3", "the gradients of each alone", SE3 + "small_and_large_motions_in_one_batch_are_as_alone"),
     ("equal knots, all knots 0", "linear_spline, cubic_spline", "stands still, gradients agree with differences", SE3 + "splines_of_equal_knots_stand_still_and_gradients_pass"),
     ("where two pieces meet", "cubic_spline", "two derivatives are continuous", SE3 + "a_cubic_spline_is_smooth_where_pieces_meet"),
+    ("one training view", "train fit with a path", "its middle stays, the curve is finite", PATH + "one_training_view_has_a_path_too"),
     ("one camera, cameras at one place", "gauge_directions", "fewer directions, all finite", PATH + "the_directions_of_the_gauge_are_motions_that_change_no_picture"),
     ("a scene without trajectories", "load_targets", "a start of 3 px a view; DataError without a path", PATH + "without_a_trajectory_a_path_is_learned_and_without_a_path_refused"),
     ("gradients of 1e-40", "path.descend", "finite knots", PATH + "a_gradient_too_small_to_square_moves_nothing_to_nan"),

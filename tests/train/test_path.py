@@ -306,3 +306,16 @@ def test_every_method_but_the_oracle_takes_a_path(tiny, tmp_path):
     assert done["psnr"] > 12
     state, _ = load_state(tmp_path / "run/checkpoint.safetensors")
     assert state.params["path:knots"].shape == (6, 2, 6)
+
+
+def test_one_training_view_has_a_path_too(tiny, tmp_path):
+    """Its middle is all gauge and stays; a similarity cannot be told from it, so the curve takes the world as it is."""
+    with open_scene(tiny) as file:
+        scene = file.read()
+    kept = (scene.views[1], *(v for v in scene.views if v.split == "test"))
+    write_scene(tmp_path / "one.h5", replace(scene, views=kept, truth=None))
+    done = run_fit(tmp_path / "one.h5", config_of(trajectory="linear", steps=8), tmp_path / "run", eval_every=0)
+    assert np.isfinite(done["psnr"])
+    state, _ = load_state(tmp_path / "run/checkpoint.safetensors")
+    assert state.params["path:knots"].abs().max() > 1e-5
+    assert state.params["path:knots"].mean(1).abs().max() < 1e-6
