@@ -313,7 +313,7 @@ def test_one_training_view_has_a_path_too(tiny, tmp_path):
     with open_scene(tiny) as file:
         scene = file.read()
     kept = (scene.views[1], *(v for v in scene.views if v.split == "test"))
-    write_scene(tmp_path / "one.h5", replace(scene, views=kept, truth=None))
+    write_scene(tmp_path / "one.h5", replace(scene, views=kept, truth=None, events={}))
     done = run_fit(tmp_path / "one.h5", config_of(trajectory="linear", steps=8), tmp_path / "run", eval_every=0)
     assert np.isfinite(done["psnr"])
     state, _ = load_state(tmp_path / "run/checkpoint.safetensors")
