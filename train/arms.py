@@ -74,7 +74,8 @@ def motion_of(
     for k in range(ROUNDS + 1):
         normal, right, square, pixels = np.zeros((2 * len(columns),) * 2), np.zeros(2 * len(columns)), 0.0, 0
         for frame, spike, mask in zip(frames, spikes, masks, strict=True):
-            gray = moved(frame, matrix) @ weights[:3] + weights[3]
+            light = moved(frame, matrix)
+            gray = light[..., 0] * weights[0] + light[..., 1] * weights[1] + light[..., 2] * weights[2] + weights[3]
             slopes = np.gradient(gray)
             good = (moved(mask.astype(np.float32)[..., None], matrix)[..., 0] > 0.999)[used]
             rest = (spike - gray)[used][good].astype(np.float64)
@@ -137,7 +138,8 @@ def _keys(f: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
 def sources(height: int, width: int, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Where in the frames the spikes' pixels are [H,W,2], pixels, centres at halves."""
     here = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
-    return np.asarray(here + np.moveaxis(np.tensordot(matrix, _base(height, width), 1), 0, -1), np.float64)
+    one, x, y = _base(height, width)
+    return np.asarray(here + np.stack([row[0] * one + row[1] * x + row[2] * y for row in matrix], -1), np.float64)
 
 
 def _base(height: int, width: int) -> NDArray[np.float64]:

