@@ -34,14 +34,6 @@ def relative(a: torch.Tensor, b: torch.Tensor) -> float:
     return float((a.double() - b.double()).norm() / b.double().norm().clamp(min=1e-300))
 
 
-@pytest.fixture(params=_native.isas())
-def isa(request):
-    before = _native.isa()
-    _native.set_isa(request.param)
-    yield request.param
-    _native.set_isa(before)
-
-
 @pytest.mark.parametrize("domain", DOMAINS)
 def test_tfs_matches_its_definition(isa, domain):
     image, texture = picture(1), picture(2)[..., 0].contiguous()

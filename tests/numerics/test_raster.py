@@ -1,7 +1,6 @@
 """The rasteriser on hard inputs: float64 agreement inside derived tolerances, finite gradients, the same bits."""
 
 import hashlib
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -14,21 +13,6 @@ from spikerig.dataset.errors import NumericsError
 from spikerig.train import oracles
 from spikerig.train.splat import Rendered, Splats, render
 from spikerig.train.ssim import l1_ssim
-
-
-@pytest.fixture(params=_native.isas())
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = _native.isa()
-    _native.set_isa(request.param)
-    yield request.param
-    _native.set_isa(before)
-
-
-@pytest.fixture
-def threads() -> Iterator[None]:
-    before = _native.threads()
-    yield
-    _native.set_threads(before)
 
 
 def draw(scene: Splats, pose: torch.Tensor = POSE, **settings) -> Rendered:

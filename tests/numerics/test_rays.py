@@ -32,14 +32,6 @@ def awkward_points(rng):
     return np.concatenate([rng.random((40, 3)), corners]).astype(np.float32)
 
 
-@pytest.fixture(params=_native.isas())
-def isa(request):
-    before = _native.isa()
-    _native.set_isa(request.param)
-    yield request.param
-    _native.set_isa(before)
-
-
 def test_hash_encode_matches_its_definition(isa):
     rng = np.random.default_rng(1)
     table, points = table_of(LAYOUT, rng), awkward_points(rng)

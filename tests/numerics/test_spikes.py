@@ -4,17 +4,7 @@ import numpy as np
 import pytest
 from hard_spikes import LIGHTS, STREAMS
 
-from spikerig import _native
 from spikerig.dataset import kernels, oracles, texture
-
-
-@pytest.fixture(params=_native.isas())
-def isa(request):
-    before = _native.isa()
-    _native.set_isa(request.param)
-    yield request.param
-    _native.set_isa(before)
-
 
 METHODS = {
     "tfp 1": lambda s, at: texture.tfp(s, at, 1),

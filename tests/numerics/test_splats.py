@@ -1,7 +1,6 @@
 """Absgrad against float64, the rasteriser's thresholds from both sides, and what culling leaves out."""
 
 import hashlib
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -15,21 +14,6 @@ from spikerig.train.splat import Rendered, Splats, render
 
 EYE = torch.eye(4)[:3]
 LIGHT = torch.tensor(BACKGROUND, dtype=torch.float64)
-
-
-@pytest.fixture(params=_native.isas())
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = _native.isa()
-    _native.set_isa(request.param)
-    yield request.param
-    _native.set_isa(before)
-
-
-@pytest.fixture
-def threads() -> Iterator[None]:
-    before = _native.threads()
-    yield
-    _native.set_threads(before)
 
 
 def draw(scene: Splats, pose: torch.Tensor = POSE, **settings) -> Rendered:

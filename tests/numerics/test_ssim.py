@@ -1,22 +1,11 @@
 """L1 + SSIM on hard inputs, against float64."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import torch
 
-from spikerig import _native
 from spikerig.train import oracles
 from spikerig.train.ssim import l1_ssim, ssim
-
-
-@pytest.fixture(params=_native.isas())
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = _native.isa()
-    _native.set_isa(request.param)
-    yield request.param
-    _native.set_isa(before)
 
 
 def pair(height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
