@@ -5,12 +5,12 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from slow_disk import SlowDisk
 
 from spikerig.dataset.errors import DeviceError, HostError
 from spikerig.dataset.segments import PAGE, Chunk, Damage, scan
@@ -20,7 +20,6 @@ from spikerig.rigctl.host import RealHost
 from spikerig.rigctl.record_cost import PacedSource
 from spikerig.rigctl.recorder import SLOW, Recorder, RecorderOptions
 from spikerig.rigctl.ring import Ring, ring_slots
-from spikerig.rigctl.segment_writer import SegmentWriter
 from spikerig.rigctl.sim.emulate.virtual import VirtualHost
 
 MS = 1_000_000
@@ -128,19 +127,6 @@ def test_losses_on_the_link_begin_an_epoch_and_are_listed(tmp_path: Path) -> Non
     assert [e for e, _, _ in spans] == list(range(len(spans)))
     first = {c.head.epoch: c.head for c in reversed(chunks(tmp_path))}
     assert all(first[e].why == "overflow" and first[e].byte_index == 0 for e in range(1, len(spans)))
-
-
-class SlowDisk:
-    """A gate in the way of the writer's `write`."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.gate, real = threading.Event(), SegmentWriter.write
-
-        def write(writer: SegmentWriter, data: memoryview) -> tuple[Path, int]:
-            self.gate.wait(30)
-            return real(writer, data)
-
-        monkeypatch.setattr(SegmentWriter, "write", write)
 
 
 def test_a_slow_disk_ends_recording_before_anything_is_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

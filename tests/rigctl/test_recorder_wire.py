@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from dataclasses import dataclass
 from itertools import pairwise
@@ -18,13 +17,13 @@ from typing import Any
 import numpy as np
 import pytest
 from framing_scenes import wire_bytes
+from slow_disk import SlowDisk
 from vidar_bench import MID, MS, camera
 
 from spikerig.dataset.errors import DeviceError
 from spikerig.dataset.framing import find_phase, rates_at
 from spikerig.dataset.segments import PAGE, Chunk, Damage, scan
 from spikerig.rigctl.recorder import SLOW, Recorder, RecorderOptions
-from spikerig.rigctl.segment_writer import SegmentWriter
 from spikerig.rigctl.sim.emulate.spikewire import Loop
 from spikerig.rigctl.vidar import VidarSource
 
@@ -155,28 +154,15 @@ def test_a_camera_that_stays_away_costs_nothing_that_came(tmp_path: Path) -> Non
     assert run.kinds() == ["silent", "stopped", "device"]
 
 
-class Gate:
-    """Stands in the way of the writer's `write`."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.open, real = threading.Event(), SegmentWriter.write
-
-        def write(writer: SegmentWriter, data: memoryview) -> tuple[Path, int]:
-            self.open.wait(30)
-            return real(writer, data)
-
-        monkeypatch.setattr(SegmentWriter, "write", write)
-
-
 def test_keeping_ends_before_the_ring_runs_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    gate, run = Gate(monkeypatch), started(tmp_path, on_full="stop")
+    disk, run = SlowDisk(monkeypatch), started(tmp_path, on_full="stop")
     recorder, host = run.recorder, run.recorder.host
     with host.worker("main"):
         recorder.start()
         recorder.keep()
         host.sleep_until(2 * S)
         stopped = recorder.state()
-        gate.open.set()
+        disk.gate.set()
         first = recorder.pause()
         recorder.keep()
         host.sleep_until(host.now_ns() + 200 * MS)
@@ -195,13 +181,13 @@ def test_keeping_ends_before_the_ring_runs_over(tmp_path: Path, monkeypatch: pyt
 def test_losses_of_the_recorder_are_counted_apart_from_the_links(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    gate, run = Gate(monkeypatch), started(tmp_path, [{"kind": "overflow", "at_s": 2.5}], on_full="drop")
+    disk, run = SlowDisk(monkeypatch), started(tmp_path, [{"kind": "overflow", "at_s": 2.5}], on_full="drop")
     recorder, host = run.recorder, run.recorder.host
     with host.worker("main"):
         recorder.start()
         recorder.keep()
         host.sleep_until(1500 * MS)
-        gate.open.set()
+        disk.gate.set()
         while host.now_ns() < 3 * S:  # from here on the disk keeps up
             recorder.ring.drained(30)
             host.sleep_until(host.now_ns() + 50 * MS)
@@ -237,6 +223,7 @@ def test_a_full_disk_keeps_what_it_took(tmp_path: Path, monkeypatch: pytest.Monk
 CHILD = """
 import sys
 from pathlib import Path
+from slow_disk import SlowDisk
 from vidar_bench import MID, camera
 from spikerig.rigctl.host import RealHost
 from spikerig.rigctl.recorder import Recorder, RecorderOptions
